@@ -2,9 +2,9 @@
 
 By delayed acceptance and by surrogate transitions.
 
-A probe is taken in as usual. From its last population, moves of every particle go on at the posterior, each
-half learning from the other before every sweep. Of the chains' tangent coordinates the one that mixes worst
-gives the effective sample size; simulated seconds are those of the physics' own clock.
+A probe is assimilated as usual. From its last population, moves of every particle go on at the posterior,
+each half learning from the other before every sweep. Of the chains' tangent coordinates the one that mixes
+worst gives the effective sample size; simulated seconds are those of the physics' own clock.
 """
 
 from __future__ import annotations
@@ -168,7 +168,7 @@ def chains(
 
 
 def posterior(seed: int) -> tuple[Any, Population]:
-    """The scene of a probe, and its particles once all measurements are taken in, equally weighted."""
+    """The scene of a probe, and its particles given all measurements, equally weighted."""
     recording = simulate_recording(seed)
     scene = model.prepare(recording)
     *_, last = infer(model, recording, particles=PARTICLES, seed=seed, scene=scene)

@@ -176,7 +176,7 @@ def main() -> None:
         note(f"shipped {name}", 0, outcome(of, shipped, shipped.truth, 0))
 
     show("warnings", ["case", "seed", "off mm", "spread mm", "warnings"], lines)
-    words = {**{name: said for name, (_, said) in FAULTS.items()}, VIEWS: "moved", PUSHES: "moved"}
+    words = {**{name: warning for name, (_, warning) in FAULTS.items()}, VIEWS: "moved", PUSHES: "moved"}
     rows: list[Row] = []
     for case, several in runs.items():
         if case in words:

@@ -35,7 +35,7 @@ def ask(
     variables = {**os.environ, **(environment or {})}
     done = subprocess.run(command, env=variables, capture_output=True, text=True, check=False)
     if done.returncode:
-        last = (done.stderr.strip().splitlines() or ["it said nothing"])[-1]
+        last = (done.stderr.strip().splitlines() or ["it printed nothing"])[-1]
         print(f"{peer} is left out: {script} ended with status {done.returncode} ({last}).")
         return None
     return [json.loads(line) for line in done.stdout.splitlines()]

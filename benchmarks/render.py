@@ -169,7 +169,7 @@ def elsewhere(file: Path, repeats: int) -> dict[str, tuple[list[float], str]]:
         done = subprocess.run(command, env=variables, capture_output=True, text=True, check=False)
         name = f"MuJoCo, {back_end}"
         if done.returncode:
-            last = (done.stderr.strip().splitlines() or ["it said nothing"])[-1]
+            last = (done.stderr.strip().splitlines() or ["it printed nothing"])[-1]
             library = "libegl1" if back_end == "egl" else "libosmesa6"
             found[name] = (
                 [],

@@ -72,9 +72,9 @@ def test_a_collector_changes_nothing_and_hands_everything_on() -> None:
     seen = [next(watched)]
     assert watched["size"].shape == (1,), "what went by so far"
     seen += list(watched)
-    for (first, told), (second, again) in zip(plain, seen, strict=True):
+    for (first, info), (second, again) in zip(plain, seen, strict=True):
         assert torch.equal(first.trace["x"], second.trace["x"])
-        assert first.log_evidence == second.log_evidence and told.acceptance == again.acceptance
+        assert first.log_evidence == second.log_evidence and info.acceptance == again.acceptance
     columns = watched.columns
     assert columns["evidence"].tolist() == [p.log_evidence for p, _ in plain]
     assert columns["accepted"].tolist() == [i.acceptance for _, i in plain]

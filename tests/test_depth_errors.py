@@ -92,7 +92,7 @@ def test_a_camera_error_moves_the_whole_scene(kind: Kind) -> None:
 @pytest.mark.parametrize("known", [False, True])
 @pytest.mark.parametrize("each", [False, True])
 def test_a_bias_is_an_image_that_reads_less(kind: Kind, known: bool, each: bool) -> None:
-    """Their density hangs on the difference alone, so the bias can be taken off the readings instead."""
+    """Their density depends on the difference alone, so the bias can be taken off the readings instead."""
     behind = table() if known else None
     camera = replace(CAMERA, near=0.0, far=9.0)  # so that the same pixels count
     base = torch.where(image(table()) > 0.0, image(table()), math.nan)

@@ -1,7 +1,7 @@
 """The regression sblrc-blr of posteriordb, by importance sampling and by tempering from the prior.
 
 The prior is a hundred times as wide as the posterior, and a large sigma lets beta be anywhere: while the
-likelihood is let in, sigma and what is left of beta have to shrink together. Random walks and HMC, whose
+likelihood is tempered, sigma and what is left of beta have to shrink together. Random walks and HMC, whose
 scale is that of all particles, leave the few behind that go ahead.
 """
 

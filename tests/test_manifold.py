@@ -138,12 +138,12 @@ def test_quadratic_is_its_gradient_and_curvature_near_the_truth() -> None:
     value = window([-5e-5, 1e-5, -3e-5, 0.0, 3e-4, 1e-4, 1e-4], [1, 1, 1, 1, 0, 0, NAN])
     for seed in range(4):
         pose = around(1, seed, 2e-5, 2e-4)
-        said = manifold(ledge, pose, 7).quadratic(value)
+        approximation = manifold(ledge, pose, 7).quadratic(value)
         gradient, bend = differences(lambda p: manifold(ledge, p, 7), value, pose, step)
         size = float((gradient * scale).abs().max())
         # What is far off counts for a little less than it would: up to one part in sixteen per variance.
-        assert float(((said.gradient[0] - gradient) * scale).abs().max()) < 0.12 * size
-        information = said.information[0] * scale[:, None] * scale
+        assert float(((approximation.gradient[0] - gradient) * scale).abs().max()) < 0.12 * size
+        information = approximation.information[0] * scale[:, None] * scale
         curved = bend * scale[:, None] * scale
         assert float((information - curved).abs().max()) < 0.2 * float(curved.abs().max())
         assert float(torch.linalg.eigvalsh(information).min()) > -1e-9
@@ -170,9 +170,11 @@ def test_a_step_of_gauss_and_newton_leads_to_the_truth() -> None:
     pose = poses.retract(turn, torch.tensor([[8e-4, -5e-4, 6e-4, 0.01, -0.008, 0.012]]).double())
     for blur in (0.001, 0.0003, 0.0, 0.0, 0.0, 0.0):
         noise, shared = math.hypot(NOISE, blur), math.hypot(SHARED, blur)
-        said = ContactManifold(gap, pose, 6, noise, shared, SINK, OUTLIER).quadratic(value)
+        approximation = ContactManifold(gap, pose, 6, noise, shared, SINK, OUTLIER).quadratic(value)
         ridge = torch.diag(torch.tensor([1e4] * 3 + [1e1] * 3).double())
-        pose = poses.retract(pose, -torch.linalg.solve(said.information + ridge, said.gradient))
+        pose = poses.retract(
+            pose, -torch.linalg.solve(approximation.information + ridge, approximation.gradient)
+        )
     off = poses.local(turn, pose)[0]
     assert float(off[:3].norm()) < 1e-4 and float(off[3:].norm()) < 2e-3
     assert float(manifold(gap, pose, 6).residual(value).abs().max()) < 3e-5
@@ -189,9 +191,9 @@ def test_moving_all_changes_nothing_and_what_cannot_be_told_tells_nothing() -> N
     )
     silent = MIXED.clone()
     silent[:, 7] = NAN
-    said = here.quadratic(silent)
+    approximation = here.quadratic(silent)
     assert torch.equal(here.log_prob(silent), torch.zeros(20).double())
-    assert not bool(said.gradient.any()) and not bool(said.information.any())
+    assert not bool(approximation.gradient.any()) and not bool(approximation.information.any())
     shuffled = MIXED[torch.randperm(8)]
     torch.testing.assert_close(here.log_prob(shuffled), here.log_prob(MIXED))
 

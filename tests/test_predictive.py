@@ -177,7 +177,7 @@ def test_contacts_are_compared_with_chi_square_and_deep_stamps_are_counted() -> 
         expected = 2.0 * float(chi2.sf(float(error @ torch.linalg.solve(covariance, error)), 3))
         found = of_touch(heights.tolist(), [1, 1, 1])
         assert found is not None and found.probability == pytest.approx(min(1.0, expected), rel=1e-3)
-    # One stamp of four may be an outlier, two are not; and what was not told says nothing.
+    # One stamp of four may be an outlier, two are not; and what was not observed says nothing.
     one, two = (of_touch([1e-3] * (4 - n) + [-1e-3] * n, [0, 0, 0, 0]) for n in (1, 2))
     assert one is not None and two is not None and not one.surprising and two.surprising
     assert of_touch([1e-3, -1e-3], [math.nan, math.nan]) is None

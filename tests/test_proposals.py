@@ -139,7 +139,7 @@ def test_symmetry_leaves_the_target_invariant(name: str) -> None:
 
 
 def choosing() -> None:
-    """A discrete choice, a number that hangs on it, and what is seen of it."""
+    """A discrete choice, a number that depends on it, and what is seen of it."""
     which = pyro.sample("which", dist.Categorical(matrix([0.2, 0.3, 0.5])))
     x = pyro.sample("x", dist.Normal(which.double(), 0.5))
     with pyro.plate("two", 2, dim=-2):

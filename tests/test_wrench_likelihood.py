@@ -22,8 +22,8 @@ PEG = box_peg(0.016, 0.05)
 
 
 @dataclass(frozen=True)
-class Told:
-    """A track whose wrenches (N, T, 6) are told."""
+class Given:
+    """A track whose wrenches (N, T, 6) are given."""
 
     values: Tensor
     diverged: Tensor
@@ -36,16 +36,16 @@ class Told:
         return self.values[:, first:last]
 
 
-def told(particles: int, stamps: int = 1, force: float = 8.0) -> Told:
+def given(particles: int, stamps: int = 1, force: float = 8.0) -> Given:
     values = torch.tensor([0.0, 0.0, force, 0.1, -0.2, 0.05], dtype=torch.float64)
-    return Told(values.expand(particles, stamps, 6), torch.zeros(particles, dtype=torch.bool))
+    return Given(values.expand(particles, stamps, 6), torch.zeros(particles, dtype=torch.bool))
 
 
 def test_the_density_integrates_to_one() -> None:
     """Force and torque are independent, each isotropic about what is expected: two radial integrals."""
     radius = torch.logspace(-4, 2.5, 4001, dtype=torch.float64)
     for force, relative, bias in ((0.0, 0.3, 0.0), (8.0, 0.0, 0.4), (8.0, 0.3, 0.4)):
-        track = told(len(radius), force=force)
+        track = given(len(radius), force=force)
         shift = torch.full((len(radius), 6), bias, dtype=torch.float64)
         likelihood = Wrench(track, 0, 1, 0.3, 0.02, relative, bias=shift)
         center = track.values + bias
@@ -62,7 +62,7 @@ def test_the_density_integrates_to_one() -> None:
 def test_samples_follow_the_density() -> None:
     """The mean of q / p over samples of p is the mass of q: 1 for another normalised q that p covers."""
     torch.manual_seed(0)
-    track = told(40000)
+    track = given(40000)
     bias = 0.3 * torch.ones(40000, 6, dtype=torch.float64)
     p = Wrench(track, 0, 1, 0.5, 0.03, 0.1, outlier=0.2, bias=bias)
     sample = p.sample()
@@ -77,7 +77,7 @@ def test_samples_follow_the_density() -> None:
 
 
 def test_a_stamp_by_hand_and_what_is_not_looked_at() -> None:
-    track = told(1, stamps=30)
+    track = given(1, stamps=30)
     likelihood = Wrench(track, 3, 30, 0.3, 0.02, 0.0, outlier=1e-12, every=10)
     value = track.values[0, 3:30].clone()
     value[7, 0] += 0.6  # stamp 10, which is looked at
@@ -93,8 +93,8 @@ def test_a_stamp_by_hand_and_what_is_not_looked_at() -> None:
 
 
 def test_diverged_particles_are_impossible_and_bad_settings_refused() -> None:
-    track = told(3)
-    lost = Told(torch.where(torch.tensor([False, True, False])[:, None, None], torch.nan, track.values),
+    track = given(3)
+    lost = Given(torch.where(torch.tensor([False, True, False])[:, None, None], torch.nan, track.values),
                 torch.tensor([False, True, False]))  # fmt: skip
     likelihood = Wrench(lost, 0, 1, 0.3, 0.02)
     assert torch.isneginf(likelihood.log_prob(track.values[0])).tolist() == [False, True, False]
