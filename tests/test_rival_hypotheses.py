@@ -16,6 +16,7 @@ from bcppl.contact.touch import Touch
 from bcppl.errors import InputError
 from bcppl.geometry.extrusion import block, box_peg, cylinder_peg
 from bcppl.geometry.parts import Part
+from bcppl.inference.approximations.laplace import QuadraticApproximation
 from bcppl.inference.criticism import explanations
 from bcppl.inference.criticism.hypotheses import VERY_STRONG
 from bcppl.inference.criticism.rival_hypotheses import _with_contacts, approximated, log_evidence
@@ -134,9 +135,9 @@ def test_a_search_for_modes_does_not_depend_on_what_was_known_before() -> None:
     """A pose that is known to hundredths of a millimetre, and all else as it was."""
     stated = approximated(model, touched())
     assert stated.quadratic is not None
-    sure = stated.quadratic._replace(information=1e10 * torch.eye(6).double() + stated.quadratic.information)
-    sure = type(sure)(*(values[:1] for values in sure))
-    known = _with_contacts(replace(stated, adapted=sure, quadratic=sure), stated.contacts, True)
+    best = QuadraticApproximation(*(values[:1] for values in stated.quadratic))
+    sure = best._replace(information=best.information + 1e10 * torch.eye(6).double())
+    known = _with_contacts(replace(stated, adapted=sure), stated.contacts, True)
     assert known.quadratic is not None
     for again, first in zip(known.quadratic, stated.quadratic, strict=True):
         assert torch.equal(again, first)
