@@ -1,8 +1,9 @@
-"""Look, choose, touch, update, insert: the whole loop while an arm moves.
+"""Choose, touch, update, insert: the whole loop while an arm moves, from images that were taken before.
 
     python touch_and_insert.py look.h5 --robot ur --host 192.168.0.2 --probes 2
 
-`look.h5` is a recording of part, guess, peg and depth images, as `bcppl import bench` makes one.
+`look.h5` is a recording of part, guess, peg and depth images, as `bcppl import bench` makes one of a
+configuration without a wrench.
 """
 
 from __future__ import annotations

@@ -22,9 +22,9 @@ TEMPLATE = (
 ).read_text(encoding="utf-8")  # fmt: skip
 
 
-def changed(*place: Any, value: Any = None) -> str:
-    """The template with another value at a place; without one, the field is left out."""
-    content: Any = yaml.safe_load(TEMPLATE)
+def changed(*place: Any, value: Any = None, of: str = TEMPLATE) -> str:
+    """A text with another value at a place; without one, the field is left out."""
+    content: Any = yaml.safe_load(of)
     inner = content
     for key in place[:-1]:
         inner = inner[key]
@@ -54,6 +54,10 @@ WRONG = {
     ),
     "the configuration needs either pose .* or joints": changed("pose"),
     "the configuration lacks frame_from_sensor": changed("frame_from_sensor"),
+    "the configuration lacks peg, which is held": changed("peg"),
+    "the configuration lacks frame_from_peg, where": changed("frame_from_peg"),
+    r"needs either pose \(of a frame": changed("pose", of=changed("wrench")),  # its camera is on the arm
+    "lacks both wrench .* and cameras": changed("cameras", of=changed("wrench")),
     r"cameras.wrist needs either unit .* or scale": changed("cameras", "wrist", "unit"),
     r"cameras.wrist is on the arm: give its image view_0.png": changed(
         "cameras", "wrist", "images", 0, "time"

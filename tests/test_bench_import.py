@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+import yaml
 from typer.testing import CliRunner
 
 from bcppl import poses
@@ -55,6 +56,26 @@ def test_a_log_becomes_what_was_the_case(written: tuple[Path, bench_logs.Truth])
     report = "\n".join(imported.report)
     assert "pose: 5998 rows at 500 Hz" in report and "1000 Hz" in report and "8 ms late, as stated" in report
     assert "0.900 ± 0.000 kg" in report and "common stamps" in report
+
+
+def test_images_alone_are_a_recording_before_any_touch(written: tuple[Path, bench_logs.Truth]) -> None:
+    path, _ = written
+    whole, fields = command(path).recording, yaml.safe_load(path.read_text())
+    for name in ("wrench", "frame_from_peg", "frame_from_sensor", "gravity", "clock", "cut", "arm"):
+        fields.pop(name, None)
+    seen = path.with_name("seen.yaml")
+    seen.write_text(yaml.safe_dump(fields))
+    recording = command(seen).recording
+    views = [m for m in whole.measurements if m.kind == "view"]
+    assert [m.kind for m in recording.measurements] == ["view"] * len(views) and recording.peg is not None
+    for mine, theirs in zip(recording.measurements, views, strict=True):
+        np.testing.assert_array_equal(mine.observation.depth, theirs.observation.depth)
+        np.testing.assert_array_equal(
+            mine.action.camera.world_from_camera, theirs.action.camera.world_from_camera
+        )
+    del fields["pose"]  # the cameras stand
+    seen.write_text(yaml.safe_dump(fields))
+    assert len(command(seen).recording.measurements) == len(views)
 
 
 MISTAKES = {

@@ -48,7 +48,7 @@ class BagLog(Files):
         self._intrinsics: dict[str, Intrinsics] = {}
         self._wanted: dict[str, list[Collector]] = {}
         with Bag(path) as bag:
-            if fields.wrench.topic:
+            if fields.wrench is not None and fields.wrench.topic:
                 topic = bag.topic("wrench", fields.wrench.topic, [reading.WRENCH]).name
                 self._stream("wrench", topic, Rows(topic, wrench))
             for name in ("pose", "command"):

@@ -125,9 +125,9 @@ def topics(fields: BenchFields) -> Iterator[tuple[str, str]]:
                 yield stream, torques_of(held.topic)
 
 
-def refuse_axes(fields: WrenchFields, axes: str, why: str) -> None:
-    """Refuse a wrench in other axes, or about another point, than the data set's documents state."""
-    if (fields.axes, fields.about) != (axes, axes):
+def refuse_axes(fields: WrenchFields | None, topic: str, axes: str, why: str) -> None:
+    """Refuse a topic's wrench in other axes, or about another point, than the set's documents state."""
+    if fields is not None and fields.topic == topic and (fields.axes, fields.about) != (axes, axes):
         raise InputError(
             f"wrench states axes: {fields.axes}, about: {fields.about}, but {fields.topic} is {why}; state "
             f"axes: {axes}, about: {axes}."

@@ -15,7 +15,11 @@ from bcppl.recordings.importers import Imported
 from bcppl.recordings.importers.bench.bodies import read_guess, read_part, read_peg
 from bcppl.recordings.importers.bench.clocks import on_one_clock
 from bcppl.recordings.importers.bench.configuration.field_types import PoseFields
-from bcppl.recordings.importers.bench.configuration.fields import BenchFields
+from bcppl.recordings.importers.bench.configuration.fields import (
+    BenchFields,
+    GravityFields,
+    WrenchFields,
+)
 from bcppl.recordings.importers.bench.configuration.reading import read_configuration
 from bcppl.recordings.importers.bench.contacts import STEP
 from bcppl.recordings.importers.bench.cutting import Command, Rows, probes
@@ -49,10 +53,13 @@ def imported(path: Path, open_log: Callable[[BenchFields], Log] | None = None) -
         InputError: the configuration or a file that it names is missing or wrong, or the streams do not fit.
     """
     fields, folder, report = read_configuration(path), path.parent, list[str]()
-    part, peg = read_part(fields.part, folder, report), read_peg(fields.peg, folder, report)
+    part = read_part(fields.part, folder, report)
+    peg = None if fields.peg is None else read_peg(fields.peg, folder, report)
     log = Files(folder) if open_log is None else open_log(fields)
     frame = _poses(fields, log, report)
-    touches = _touches(fields, log, frame, report)
+    touches: list[Measurement] = []
+    if fields.wrench is not None and frame is not None:
+        touches = _touches(fields, fields.wrench, log, frame, report)
     views: list[Measurement] = []
     background: dict[str, Array] = {}
     for name, camera in fields.cameras.items():
@@ -72,21 +79,24 @@ def imported(path: Path, open_log: Callable[[BenchFields], Log] | None = None) -
     return Imported(recording, tuple(report))
 
 
-def _poses(fields: BenchFields, log: Log, report: list[str]) -> Stream:
-    """`world_from_frame` (T, 7), on the clock of its log."""
+def _poses(fields: BenchFields, log: Log, report: list[str]) -> Stream | None:
+    """`world_from_frame` (T, 7), on the clock of its log; None where nothing was on the robot."""
     world_from_base = stated_pose("world_from_base", fields.world_from_base)
     if fields.joints is not None:
         return placed(read_joints(fields.joints, log, report), world_from_base)
-    assert fields.pose is not None
+    if fields.pose is None:
+        return None
     return placed(read_poses("pose", fields.pose, log, report), world_from_base)
 
 
-def _touches(fields: BenchFields, log: Log, frame: Stream, report: list[str]) -> list[Measurement]:
+def _touches(
+    fields: BenchFields, felt_by: WrenchFields, log: Log, frame: Stream, report: list[str]
+) -> list[Measurement]:
     """The windows of the log's probes; their stamps count from the first pose."""
-    mounting = _Mounting.of(fields)
+    mounting = _Mounting.of(fields, felt_by)
     start = float(frame.times[0])
     frame = frame.shifted(-start)
-    wrench = read_wrench(fields.wrench, log, report).shifted(-start)
+    wrench = read_wrench(felt_by, log, report).shifted(-start)
     wrench = on_one_clock(wrench, *_motion(wrench, frame, mounting), fields.clock, report)
     stamps = common_stamps(frame, wrench, fields.cut.rate)
     if len(stamps) < 2:
@@ -106,17 +116,19 @@ def _touches(fields: BenchFields, log: Log, frame: Stream, report: list[str]) ->
 class _Mounting:
     """Where peg and sensor are on the robot's frame, and the base in the world."""
 
-    fields: BenchFields
+    gravity: GravityFields
+    wrench: WrenchFields
     world_from_base: Array
     frame_from_peg: Array
     frame_from_sensor: Array
 
     @classmethod
-    def of(cls, fields: BenchFields) -> _Mounting:
+    def of(cls, fields: BenchFields, wrench: WrenchFields) -> _Mounting:
         return cls(
-            fields,
+            fields.gravity,
+            wrench,
             stated_pose("world_from_base", fields.world_from_base),
-            stated_pose("frame_from_peg", fields.frame_from_peg),
+            _stated("frame_from_peg", fields.frame_from_peg),
             _stated("frame_from_sensor", fields.frame_from_sensor),
         )
 
@@ -130,10 +142,10 @@ class _Mounting:
         for first in range(0, len(stamps), _ROWS):  # all at once, ten minutes at 1 kHz took 400 MB
             rows = slice(first, first + _ROWS)
             base_from_frame = composed(base_from_world, world_from_frame[rows])
-            on_peg[rows] = wrench_on_peg(on_peg[rows], self.fields.wrench, base_from_frame, *sides)
+            on_peg[rows] = wrench_on_peg(on_peg[rows], self.wrench, base_from_frame, *sides)
             world_from_peg[rows] = composed(world_from_frame[rows], self.frame_from_peg)
         peg_from_sensor = composed(inverted(self.frame_from_peg), self.frame_from_sensor)
-        felt, words = without_weight(on_peg, world_from_peg, stamps, self.fields.gravity, peg_from_sensor)
+        felt, words = without_weight(on_peg, world_from_peg, stamps, self.gravity, peg_from_sensor)
         return felt, world_from_peg, words
 
 

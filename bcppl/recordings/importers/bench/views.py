@@ -22,7 +22,7 @@ _AROUND = 0.01  # s to either side of an image, over which the arm's speed is me
 
 
 def read_views(
-    name: str, fields: CameraFields, log: Log, world_from_frame: Stream, report: list[str]
+    name: str, fields: CameraFields, log: Log, world_from_frame: Stream | None, report: list[str]
 ) -> tuple[list[Measurement], dict[str, Array]]:
     """The views of one camera, and its background by name.
 
@@ -30,7 +30,7 @@ def read_views(
         name: of the camera.
         fields: its intrinsics, images and pose.
         log: that the images are in.
-        world_from_frame: the poses (T, 7) of the robot's frame, on the pose's clock.
+        world_from_frame: the poses (T, 7) of the robot's frame, on their clock; None if none are needed.
         report: to which a line is added.
 
     Raises:
@@ -38,7 +38,7 @@ def read_views(
     """
     fields = log.intrinsics(name, fields)
     shots, notes = log.shots(name, fields)
-    if fields.every is not None and fields.frame_from_camera is not None:
+    if fields.every is not None and fields.needs_motion and world_from_frame is not None:
         when = factor(fields.time_unit) * np.array([shot.image.time for shot in shots])
         known = is_known(world_from_frame, when, None)
         if not known.all():
@@ -90,7 +90,7 @@ def _camera(
     fields: CameraFields,
     image: ImageFields,
     shape: tuple[int, ...],
-    world_from_frame: Stream,
+    world_from_frame: Stream | None,
 ) -> tuple[Camera, float]:
     """The camera of one image, and the arm's speed (m/s) when it was taken."""
     stands = fields.world_from_camera
@@ -122,7 +122,7 @@ def _camera(
     if image.world_from_frame is not None:
         at, speed = stated_pose(f"{place.where}.world_from_frame", image.world_from_frame), 0.0
     else:
-        assert image.time is not None
+        assert image.time is not None and world_from_frame is not None
         at, speed = _at_time(place.where, factor(fields.time_unit) * image.time, world_from_frame)
     return camera.on(at, place.viewpoint), speed
 

@@ -120,8 +120,7 @@ class FmbLog(ArrayLog):
         cameras = any(camera.topic for camera in fields.cameras.values())
         if not cameras and not list(topics(fields)):
             raise InputError(f"no field names an array of {trajectory.path}; name some.")
-        if fields.wrench.topic == FORCE:
-            refuse_axes(fields.wrench, "frame", "in the end effector's axes, about its origin")
+        refuse_axes(fields.wrench, FORCE, "frame", "in the end effector's axes, about its origin")
 
     def rows(self, name: str, fields: StreamFields) -> tuple[Array, list[str]]:
         """Stamps in seconds and columns (T, 1 + C) of a stream, and that its stamps are made.

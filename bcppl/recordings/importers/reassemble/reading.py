@@ -60,10 +60,8 @@ class ReassembleArrays:
         for camera, each in fields.cameras.items():
             if each.topic:
                 raise InputError(f"cameras.{camera} names {each.topic!r}; REASSEMBLE has no depth images.")
-        if fields.wrench.topic == _SENSOR:
-            refuse_axes(fields.wrench, "sensor", "in the sensor's axes, about its origin")
-        if fields.wrench.topic == _BASE:
-            refuse_axes(fields.wrench, "base", "in the base's axes, about its origin")
+        refuse_axes(fields.wrench, _SENSOR, "sensor", "in the sensor's axes, about its origin")
+        refuse_axes(fields.wrench, _BASE, "base", "in the base's axes, about its origin")
         self._held: dict[str, Numbers] = {}
         within = [f"{group}/{name}" for _, name in named for group in (STATE, STAMPS)]
         with opened(path, _REMEDY, within) as file:

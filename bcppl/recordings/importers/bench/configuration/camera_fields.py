@@ -49,6 +49,12 @@ class CameraFields(Fields):
     images: list[ImageFields] = []
     background: str | None = None
 
+    @property
+    def needs_motion(self) -> bool:
+        """Whether an image is placed by where the robot was at its time."""
+        stated = self.images and all(image.world_from_frame is not None for image in self.images)
+        return self.frame_from_camera is not None and not stated
+
     @model_validator(mode="after")
     def _sourced(self) -> Self:
         stated = [each is not None for each in (self.fx, self.fy, self.cx, self.cy)]

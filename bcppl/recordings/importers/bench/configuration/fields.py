@@ -214,16 +214,16 @@ class GuessFields(Fields):
 
 
 class BenchFields(Fields):
-    """A whole configuration."""
+    """A whole configuration: of touches, or without a wrench of depth images alone."""
 
     part: BodyFields
-    peg: PegFields
+    peg: PegFields | None = None
     guess: GuessFields
-    wrench: WrenchFields
+    wrench: WrenchFields | None = None
     pose: PoseStreamFields | None = None
     joints: JointFields | None = None
     command: PoseStreamFields | None = None
-    frame_from_peg: PoseFields
+    frame_from_peg: PoseFields | None = None
     frame_from_sensor: PoseFields | None = None
     world_from_base: PoseFields = PoseFields()
     clock: ClockFields = ClockFields()
@@ -237,8 +237,24 @@ class BenchFields(Fields):
 
     @model_validator(mode="after")
     def _complete(self) -> Self:
-        if (self.pose is None) == (self.joints is None):
+        if self.wrench is None and not self.cameras:
+            raise ValueError("lacks both wrench (of touches) and cameras; add one of them")
+        if self.wrench is None and self.command is not None:
+            raise ValueError("has a command but no wrench, and so no touches; leave it out, or add wrench")
+        placed = any(camera.needs_motion for camera in self.cameras.values())
+        if self.pose is not None and self.joints is not None:
+            raise ValueError("has both pose and joints; give one")
+        if (self.wrench is not None or placed) and self.pose is None and self.joints is None:
             raise ValueError("needs either pose (of a frame of the robot) or joints (with a urdf and a tip)")
+        return self
+
+    @model_validator(mode="after")
+    def _touched(self) -> Self:
+        if self.wrench is None:
+            return self
+        for name, why in (("peg", "which is held"), ("frame_from_peg", "where the peg is on the frame")):
+            if getattr(self, name) is None:
+                raise ValueError(f"lacks {name}, {why}; add it")
         used = "sensor" in (self.wrench.axes, self.wrench.about) or self.gravity.load == "stated"
         if used and self.frame_from_sensor is None:
             raise ValueError("lacks frame_from_sensor, where the wrench's sensor is on the frame; add it")
