@@ -68,12 +68,13 @@ def swept(
         share: (k, n): only the k-th of n equal shares of the cells, k from 1.
 
     Raises:
-        InputError: the file holds something else, or the share is none.
+        InputError: the file holds something else, or there is no such share or number of jobs.
         InferenceError: (from the iterator) cells have failed.
     """
     number, shares = share
     if not 1 <= number <= shares:
         raise InputError(f"share {number} of {shares} does not exist; give one from 1 of {shares}.")
+    _refuse_none(jobs)
     mine = {key_of(cell): cell for cell in list(cells)[number - 1 :: shares]}
     return _each(partial(_evaluated, function, file), mine, {} if file is None else kept(file), jobs)
 
@@ -108,8 +109,9 @@ def in_order(
         jobs: how many at a time; with one everything stays in this process, with all its threads.
 
     Raises:
-        InputError: the function cannot be sent to another process.
+        InputError: the function cannot be sent to another process, or there is no such number of jobs.
     """
+    _refuse_none(jobs)
     return _parallel(function, arguments, jobs, "generator")
 
 
@@ -197,6 +199,11 @@ def _evaluated(function: Callable[[Any], Any], file: Path | None, cell: Cell) ->
         return Failure(one_line(error))
     finally:
         torch.set_num_threads(threads)
+
+
+def _refuse_none(jobs: int) -> None:
+    if jobs != -1 and not jobs >= 1:
+        raise InputError(f"{jobs} jobs at a time were asked for; give 1 or more, or -1 for all cores.")
 
 
 def _numbered(function: Callable[[Argument], Result], item: tuple[int, Argument]) -> tuple[int, Result]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import warnings
+from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -105,7 +106,10 @@ def _populations(runs: Any) -> list[Population]:
 
 
 def population_of(given: Any, asked: str) -> Population:
-    """The population that is given, or that what is given has, such as a step of SMC."""
+    """The population that is given, or that what is given has: a step of SMC, or the last of an iterator."""
+    if isinstance(given, Iterator):
+        last = deque(given, maxlen=1)
+        given = last[0] if last else None
     population = getattr(given, "population", given)
     if not isinstance(population, Population):
         raise InputError(f"a {type(given).__name__} was given in place of a population; give {asked}.")

@@ -6,12 +6,15 @@ Zhou, Johansen and Aston, Toward automatic model comparison: an adaptive sequent
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from itertools import pairwise
 
 import torch
 from torch import Tensor
 
+from bcppl.arguments import number_within
 from bcppl.beliefs import normalised
+from bcppl.errors import InputError
 
 # A step is at least this share of the exponent that is reached. The first is as small as a likelihood is
 # sharp: about 1e-12 for a standard deviation of 1e-6 of the prior's.
@@ -34,10 +37,25 @@ def conditional_effective_sample_size(weights: Tensor, log_factor: Tensor) -> fl
     return float(len(weights) * weighted.sum() ** 2 / (weighted @ factor))
 
 
+def fixed_exponents(exponents: Sequence[float]) -> tuple[float, ...]:
+    """Exponents of tempering that are given: above 0, increasing, the last 1.
+
+    Raises:
+        InputError: they are others.
+    """
+    fixed = tuple(number_within("tempering is given the exponent {}", e) for e in exponents)
+    if fixed[-1:] != (1.0,) or any(b <= a for a, b in pairwise((0.0, *fixed))):
+        raise InputError(
+            f"tempering is given the exponents {list(fixed)}; give increasing ones that end with 1."
+        )
+    return fixed
+
+
 def next_exponent(log_weights: Tensor, log_likelihood: Tensor, exponent: float, share: float = 0.5) -> float:
     """The next exponent in (exponent, 1] for a likelihood (N,) tempered by `exponent`.
 
-    Particles with a log-likelihood of -inf lose their weight at any exponent; the others are bisected over.
+    It keeps a `share` of the conditional effective sample size; with a share of 0 it is 1. Particles with a
+    log-likelihood of -inf lose their weight at any exponent; the others are bisected over.
     """
     finite = torch.isfinite(log_likelihood) & (log_weights > -torch.inf)
     if not bool(finite.any()):

@@ -164,7 +164,7 @@ class Population:
         try:
             founders = self.founders.index_select(0, ancestors)
         except (IndexError, RuntimeError, TypeError):
-            return self.selected(particles_at(ancestors, len(self)))
+            return self.selected(self._numbered(ancestors))
         count = len(ancestors)
         if count == 0:
             raise InputError("a population is to go on with no particle; give the ancestors of 1 or more.")
@@ -177,6 +177,15 @@ class Population:
         )
         drawn.__dict__["log_total"] = math.log(count)
         return drawn
+
+    def _numbered(self, ancestors: Tensor) -> Tensor:
+        try:
+            return particles_at(ancestors, len(self))
+        except (IndexError, TypeError) as error:
+            raise InputError(
+                f"a population is to go on with ancestors that are no particles ({error}); give numbers from "
+                f"0 to {len(self) - 1}."
+            ) from error
 
     @overload
     def __getitem__(self, index: str) -> Tensor: ...

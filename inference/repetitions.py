@@ -19,9 +19,9 @@ from __future__ import annotations
 
 import math
 import pickle
-from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from multiprocessing import get_context
@@ -45,7 +45,7 @@ from bcppl.traces import Trace
 Run = Callable[[int], Any]
 
 
-def repeated(run: Run, times: int, seed: int = 0, *, processes: int = 1, progress: bool = True) -> Repeated:
+def repeated(run: Run, times: int, seed: int = 0, *, jobs: int = 1, progress: bool = True) -> Repeated:
     """Run the same inference several times, independently.
 
     Args:
@@ -53,24 +53,24 @@ def repeated(run: Run, times: int, seed: int = 0, *, processes: int = 1, progres
             those, of which the last counts. Torch's generator is set to the seed before each call.
         times: how many runs.
         seed: the runs' own seeds are derived from it; torch's own generator is left as it was.
-        processes: above 1, runs are distributed over processes, this one and fresh ones. Then `run` must be
-            importable there (a function of a module, or a `functools.partial` of one),
-            and a script must keep its own work behind `if __name__ == "__main__":`.
+        jobs: how many at a time: above 1 in processes, this one and fresh ones. Then `run` must be importable
+            there (a function of a module, or a `functools.partial` of one), and a script must keep its own
+            work behind `if __name__ == "__main__":`. Runs of other processes come without `approximation`.
         progress: show a bar, on a terminal or in a notebook.
 
     Raises:
-        InputError: `times`, `processes` or the seed is out of range, `run` gives no population, it cannot be
+        InputError: `times`, `jobs` or the seed is out of range, `run` gives no population, it cannot be
             sent to another process, or the runs differ in addresses or observations.
-        InferenceError: a run fails; names it and its seed.
+        InferenceError: a run fails, or its process ends; names it and its seed.
     """
     times = whole_number("{} runs were asked for", times)
-    processes = min(whole_number("runs in {} processes were asked for", processes), times)
+    jobs = min(whole_number("{} runs at a time were asked for", jobs), times)
     seeds = [int(s) for s in np.random.SeedSequence(seed_number(seed)).generate_state(times)]
-    if processes == 1:
+    if jobs == 1:
         numbered = watched(list(enumerate(seeds, 1)), description="runs", progress=progress)
         populations = [_population(run, each, number) for number, each in numbered]
     else:
-        populations = _distributed(run, seeds, processes, progress)
+        populations = _distributed(run, seeds, jobs, progress)
     check_alike(populations)
     return Repeated(tuple(populations), tuple(seeds))
 
@@ -289,16 +289,12 @@ def _of_run(population: Population, log_evidence: Tensor) -> Tensor:
 def _population(run: Run, seed: int, number: int) -> Population:
     try:
         with seeded(seed):
-            result = run(seed)
-            if isinstance(result, Iterator):
-                last = deque(result, maxlen=1)
-                result = last[0] if last else None
+            return population_of(run(seed), "runs that return one, a step of SMC, or an iterator over those")
     except InferenceError as error:
         raise type(error)(f"run {number} (seed {seed}): {error}") from error
-    return population_of(result, "runs that return one, a step of SMC, or an iterator over those")
 
 
-def _distributed(run: Run, seeds: Sequence[int], processes: int, progress: bool) -> list[Population]:
+def _distributed(run: Run, seeds: Sequence[int], jobs: int, progress: bool) -> list[Population]:
     """The runs in several processes, this one among them.
 
     A program and its simulators stay in their process: another process sends numbers only, which are put
@@ -311,10 +307,10 @@ def _distributed(run: Run, seeds: Sequence[int], processes: int, progress: bool)
             f"the run cannot be sent to another process ({error}); "
             "give a function of a module, or a functools.partial of one."
         ) from error
-    here = range(0, len(seeds), processes)
-    threads = max(1, torch.get_num_threads() // processes)
+    here = range(0, len(seeds), jobs)
+    threads = max(1, torch.get_num_threads() // jobs)
     with ProcessPoolExecutor(
-        processes - 1, get_context("spawn"), initializer=torch.set_num_threads, initargs=(threads,)
+        jobs - 1, get_context("spawn"), initializer=torch.set_num_threads, initargs=(threads,)
     ) as pool:
         elsewhere = {
             k: pool.submit(_numbers, run, seeds[k], k + 1) for k in range(len(seeds)) if k not in here
@@ -325,7 +321,14 @@ def _distributed(run: Run, seeds: Sequence[int], processes: int, progress: bool)
                 runs[k] = _population(run, seeds[k], k + 1)
                 _refuse_series(runs[k])
             else:
-                runs[k] = _put_into(runs[0], *elsewhere[k].result())
+                try:
+                    numbers = elsewhere[k].result()
+                except BrokenProcessPool as error:
+                    what = (
+                        f"run {k + 1} (seed {seeds[k]}): its process, or one beside it, has ended ({error})"
+                    )
+                    raise InferenceError(what) from error
+                runs[k] = _put_into(runs[0], *numbers)
     return [runs[k] for k in range(len(seeds))]
 
 
@@ -337,7 +340,9 @@ def _numbers(run: Run, seed: int, number: int) -> tuple[Numbers, Numbers]:
     population = _population(run, seed, number)
     trace = population.trace
     values = {"choices": trace.choices, "observations": trace.observations, "known": trace.known}
-    rest = {f.name: getattr(population, f.name) for f in fields(population) if f.name != "trace"}
+    # What an approximation is given of the program stays in its process, too.
+    others = [f.name for f in fields(population) if f.name not in ("trace", "approximation")]
+    rest = {name: getattr(population, name) for name in others}
     return (
         {name: {a: v.numpy() for a, v in part.items()} for name, part in values.items()},
         {name: v.numpy() if isinstance(v, Tensor) else v for name, v in rest.items()},
@@ -358,4 +363,4 @@ def _put_into(first: Population, values: Numbers, rest: Numbers) -> Population:
         name: torch.as_tensor(v) if isinstance(v, np.ndarray) else v for name, v in rest.items()
     }
     trace = replace(first.trace, particles=len(other["log_weights"]), carried={}, **back)
-    return replace(first, trace=trace, **other)
+    return replace(first, trace=trace, approximation=None, **other)

@@ -13,7 +13,7 @@ import torch
 from bcppl.arguments import whole_number
 from bcppl.beliefs import normalised
 from bcppl.errors import InputError
-from bcppl.inference.population import Population
+from bcppl.inference.population import Population, refuse_no_population
 from bcppl.inference.resampling import Scheme, systematic
 from bcppl.traces.carried import Branching
 from bcppl.traces.series import SeriesTrace
@@ -26,6 +26,7 @@ def resize(population: Population, count: int, scheme: Scheme = systematic) -> P
         InferenceError: no particle has any weight.
         InputError: `count` is no whole number, 1 or more.
     """
+    refuse_no_population("resize", population)
     return population.selected(scheme(population.log_weights, count))
 
 
@@ -35,6 +36,7 @@ def replicate(population: Population, times: int) -> Population:
     Raises:
         InputError: `times` is no whole number, 1 or more.
     """
+    refuse_no_population("replicate", population)
     times = whole_number("particles are to be replicated {} times", times)
     return population[torch.arange(len(population)).repeat_interleave(times)]
 
@@ -49,6 +51,7 @@ def merge(population: Population) -> Population:
         InferenceError: no particle has any weight.
         InputError: the population is of a series, or its likelihoods are estimated by filters (`marginal`).
     """
+    refuse_no_population("merge", population)
     carried = population.trace.carried.values()
     if isinstance(population.trace, SeriesTrace) or any(isinstance(e.state, Branching) for e in carried):
         raise InputError(

@@ -43,6 +43,7 @@ from bcppl.geometry.camera import Camera, bin_depth
 from bcppl.geometry.parts import Part
 from bcppl.rendering.ray_casting import RayCaster
 from bcppl.robot.kinematics import Robot
+from bcppl.sensors.scene import chosen as chosen_settings
 from bcppl.traces import Trace
 
 WIDER = 1.3  # than the fit: of the proposal
@@ -180,11 +181,12 @@ def prepare(
         settings: fields of `Settings`.
 
     Raises:
-        InputError: as `Robot.drawn`, or there is not one image, or one mask of its size, for each view.
+        InputError: as `Robot.as_part`, a setting is unknown or out of range, or there is not one image, or
+            one mask of its size, for each view.
     """
     if len(images) != len(angles):
         raise InputError(f"{len(angles)} views are given {len(images)} depth images; give one for each.")
-    chosen = Settings(**settings)
+    (chosen,) = chosen_settings("arm_in_view", settings, Settings())
     still = replace(camera, world_from_camera=poses.identity().numpy())
     small = still.binned(chosen.bins)
     binned = _binned(images, still, chosen.bins)

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from typing import Any
 
@@ -44,13 +44,13 @@ class DepthSettings:
     """Noise of a depth image.
 
     Attributes:
-        depth_scale: of the Laplace noise, metres.
+        scale: of the Laplace noise of a pixel, metres.
         outlier: the probability that a pixel shows something else than the rendered scene.
         effective_pixels: the number of independent pixels that an image is worth; the error of a camera's
             pose is common to all.
     """
 
-    depth_scale: float = field(default=0.003, metadata=POSITIVE)
+    scale: float = field(default=0.003, metadata=POSITIVE)
     outlier: float = field(default=0.1, metadata=PROBABILITY)
     effective_pixels: float = field(default=50.0, metadata=POSITIVE)
 
@@ -92,8 +92,7 @@ def by_known_cameras(
             cannot be touched.
     """
     depth, probe = chosen(name, settings, DepthSettings(), PROBE)
-    noise = {"scale": depth.depth_scale, "outlier": depth.outlier, "effective_pixels": depth.effective_pixels}
-    camera = CalibratedCamera(recording, renderer(recording.part), **noise)
+    camera = CalibratedCamera(recording, renderer(recording.part), **asdict(depth))
     windows = partial(simulated_probe, settings=probe)
     likelihoods = likelihoods_for(recording, {"view": lambda _: camera, "window": windows})
     return Scene(prior_from_guess(recording.guess), likelihoods, name)
@@ -117,7 +116,8 @@ def prepare(
     longest = math.inf if recording.peg is None else float(recording.peg.extent.max())
     for name, value, most in (("grip_shift", grip_shift, longest), ("grip_turn", grip_turn, math.pi)):
         what = (
-            f"a spread is in metres or radians, and positive unless the model is peg_in_hole; {name} is {{}}"
+            "how far a peg is off in the hand has a positive spread, in metres or radians (peg_in_hole takes "
+            f"it to be exact); {name} is {{}}"
         )
         number_within(what, value, above=0.0, most=most)
     spread = torch.tensor([grip_shift] * 3 + [grip_turn] * 3, dtype=torch.float64)

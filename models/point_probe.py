@@ -80,15 +80,15 @@ def estimate_settings(recording: Recording, **settings: Any) -> FingerSettings:
         settings: fields of `FingerSettings` that are given and not estimated.
 
     Raises:
-        InputError: the recording has no true pose, or fewer than 10 of its pushes touch.
+        InputError: the recording has no true pose, fewer than 10 of its pushes touch, or a setting is unknown
+            or out of range.
     """
     if recording.truth is None:
         raise InputError("settings are estimated at a known pose; give a recording with its true pose.")
     truth = torch.as_tensor(recording.truth, dtype=torch.float64)
     distance = SignedDistance(recording.part)
-    start = replace(
-        FingerSettings(), **{**settings, "finger": (0.0, 0.0, 0.0)}
-    )  # onsets are of the recorded tip
+    (given,) = chosen("point_probe", settings, FingerSettings())
+    start = replace(given, finger=(0.0, 0.0, 0.0))  # onsets are of the recorded tip
     pushes = [(m.action, m.observation) for m in recording.measurements]
     contacts = [contact_of(push, touch, start) for push, touch in pushes]
     kept = [k for k, one in enumerate(contacts) if not bool(one.direction.isnan())]

@@ -75,7 +75,7 @@ COUNTS: dict[str, Callable[[Any], Any]] = {
     "moves": lambda n: markov_chains(WALK, population(), n),
     "every": lambda n: markov_chains(WALK, population(), 3, every=n),
     "runs": lambda n: repeated(lambda seed: population(), n),
-    "processes": lambda n: repeated(lambda seed: population(), 1, processes=n),
+    "jobs": lambda n: repeated(lambda seed: population(), 1, jobs=n),
     "particles": lambda n: importance_sampling(program, (), SEEN, n),
     "order": rotations,
     "candidates": lambda n: generate_stratified(program, (), SEEN, 4, candidates=n),
@@ -173,7 +173,7 @@ def test_particles_are_indexed_as_the_entries_of_a_tensor(make: Callable[[], Any
 
 def test_ancestors_and_traces_that_do_not_fit_are_refused() -> None:
     for wrong in ([5], [0.5]):
-        with pytest.raises(IndexError):
+        with pytest.raises(InputError, match=r"ancestors that are no particles .* from 0 to 4"):
             population().selected(torch.tensor(wrong))
     with pytest.raises(InputError, match="with no particle"):
         population().selected(torch.tensor([], dtype=torch.int64))

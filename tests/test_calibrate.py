@@ -177,16 +177,16 @@ def test_it_goes_on_from_a_folder(tmp_path: Path) -> None:
 @pytest.mark.long
 def test_in_several_processes_it_gives_the_same() -> None:
     joint, inference = NORMAL, partial(normal_inference, exact)
-    one, two = (calibrate(joint, inference, 4, seed=1, processes=k) for k in (1, 2))
+    one, two = (calibrate(joint, inference, 4, seed=1, jobs=k) for k in (1, 2))
     assert np.array_equal(one.ranks, two.ranks) and np.allclose(one.posterior, two.posterior, rtol=1e-12)
 
 
 def test_functions_of_a_notebook_run_in_other_processes_and_open_files_do_not(tmp_path: Path) -> None:
     inference = partial(normal_inference, exact)
-    one, two = (calibrate(NORMAL, lambda data: inference(data), 2, processes=k) for k in (1, 2))
+    one, two = (calibrate(NORMAL, lambda data: inference(data), 2, jobs=k) for k in (1, 2))
     assert np.array_equal(one.ranks, two.ranks)
     with (tmp_path / "log").open("w") as log, pytest.raises(InputError, match="cannot be sent to another"):
-        calibrate(NORMAL, lambda data: print(data, file=log), 2, processes=2)
+        calibrate(NORMAL, lambda data: print(data, file=log), 2, jobs=2)
 
 
 def test_quantities_of_ones_own_are_ranked(tmp_path: Path) -> None:

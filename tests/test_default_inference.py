@@ -12,8 +12,10 @@ import torch
 import bcppl
 from bcppl.cli import loading
 from bcppl.errors import InputError
+from bcppl.inference import smc, tempered
 from bcppl.inference.filters import bayes_contact, guided_smc, tempered_smc
 from bcppl.inference.filters.default import default_inference
+from bcppl.inference.proposals import drift
 from bcppl.models import load_recording, look_and_touch, part_in_view, point_probe
 from tests.command_line import short
 from tests.made_recordings import assert_one_sentence
@@ -59,6 +61,11 @@ def test_what_cannot_be_run_is_refused_in_one_sentence() -> None:
     for message, call in {
         "a module in place of a model": lambda: bcppl.infer(point_probe, recording),  # type: ignore[arg-type]
         "a str in place of a recording": lambda: bcppl.infer(model, "point_probe_10_pushes"),
+        r"tempered_smc has no setting 'particle'; .* particles,": lambda: bcppl.infer(
+            model, recording, particle=5
+        ),
+        "smc is given something else than a step": lambda: smc(model, recording, step=drift("x")),  # type: ignore[arg-type]
+        "given a str in place of a recording": lambda: smc(model, "own.h5", step=tempered()),
         "names 'guided'": lambda: bcppl.infer(replace(model, inference=("guided", {})), recording),
         "measurement 0 gives no observation": lambda: bcppl.infer(
             replace(model, observe=lambda scene, measurements: {}), recording, particles=5

@@ -124,6 +124,23 @@ def test_a_measurement_that_nothing_explains_is_left_out_or_ends_it(touched: Rec
     assert any("left out" in str(each.message) for each in caught)
 
 
+def test_an_error_of_a_callback_ends_the_filter_and_is_seen(touched: Recording) -> None:
+    def broken(step: Any, update: Any) -> None:
+        raise KeyError("of the callback")
+
+    first, second = touched.measurements[:2]
+    with Filter(model, replace(touched, measurements=[]), particles=FEW, on_update=broken) as live:
+        live.observe(first.action, first.observation)
+        with pytest.raises(KeyError, match="of the callback"):
+            live.settle()
+        with pytest.raises(KeyError, match="of the callback"):
+            live.observe(second.action, second.observation)
+    with Filter(model, replace(touched, measurements=[]), particles=FEW) as live:
+        pass
+    with pytest.raises(InputError, match="the live filter is closed"):
+        live.observe(first.action, first.observation)
+
+
 def joined_touch(recording: Recording) -> Touch:
     both = [m.observation for m in recording.measurements[:2]]
     return Touch(*(np.concatenate([getattr(t, f) for t in both]) for f in FIELDS))

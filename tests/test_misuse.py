@@ -32,11 +32,13 @@ from bcppl.inference.kernels import (
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import drift
 from bcppl.inference.saved import load, save
+from bcppl.inference.sizing import merge, replicate, resize
 from bcppl.inference.structures import Jump, Strata, generate_strata, jump, save_strata
 from bcppl.inference.summaries import mean
 from bcppl.inference.targets import POSTERIOR
 from bcppl.inference.verbs import rejuvenate, resample, update
-from bcppl.traces import Trace, check_program, generate, structural
+from bcppl.sweeps import swept
+from bcppl.traces import Trace, check_program, extend, generate, structural
 
 
 def number(value: float) -> Tensor:
@@ -131,6 +133,16 @@ MISUSES: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: update(start().trace, SEEN),  # type: ignore[arg-type]
         r"update is given a Trace .* Population\(trace, log_weights\), or use a verb of bcppl.traces",
     ),
+    "a population for the verbs of traces": (
+        lambda: extend(start(), (1,), {"y_0": 0.4}),  # type: ignore[arg-type]
+        "extend is given a Population in place of a trace; .* bcppl.inference.extend",
+    ),
+    "a trace to enlarge": (lambda: resize(start().trace, 30), "resize is given a Trace"),  # type: ignore[arg-type]
+    "a trace to copy": (lambda: replicate(start().trace, 2), "replicate is given a Trace"),  # type: ignore[arg-type]
+    "a trace to merge": (lambda: merge(start().trace), "merge is given a Trace"),  # type: ignore[arg-type]
+    "ancestors that are not there": (lambda: start().selected(torch.tensor([25])), "from 0 to 19"),
+    "ancestors that are no numbers": (lambda: start().selected(torch.tensor([0.5])), "from 0 to 19"),
+    "no job": (lambda: swept(abs, [1], jobs=0), "0 jobs at a time .* 1 or more, or -1"),
     "a number to run": (lambda: generate(3, (), {}, 4), "a program is a function, and int is given"),  # type: ignore[arg-type]
     "a trace to resample": (lambda: resample(start().trace), "resample is given a Trace"),  # type: ignore[arg-type]
     "a trace to move": (lambda: rejuvenate(start().trace, walk), "rejuvenate is given a Trace"),  # type: ignore[arg-type]

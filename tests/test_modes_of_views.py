@@ -6,6 +6,7 @@ import functools
 import math
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import pyro
 import pyro.distributions as dist
@@ -24,7 +25,7 @@ from bcppl.geometry.parts import Part
 from bcppl.geometry.turns import box_turns
 from bcppl.inference.approximations.gaussian import GaussianApproximation
 from bcppl.inference.approximations.laplace import QuadraticApproximation
-from bcppl.inference.filters import second_search
+from bcppl.inference.filters import guided_smc, second_search
 from bcppl.inference.filters.guided_smc import by_mode, infer
 from bcppl.inference.filters.smc import Step
 from bcppl.inference.planning.metrology import three_two_one
@@ -234,7 +235,8 @@ def test_a_population_that_misses_the_mode_is_replaced_by_evidence() -> None:
         falling_short(790.0),
     )
     torch.manual_seed(0)
-    other = second_search.searched(lost, around(1.0))
+    other, chosen = second_search.searched(lost, around(1.0))
+    assert chosen is not None and bool((chosen >= 50).all())
     assert float((other["x"] - 1.0 / 1.01).abs().max()) < 0.5 and len(other) == 50
     # The mean of two estimates, one of them nothing.
     assert other.log_evidence == pytest.approx(exact - math.log(2.0), abs=0.05)
@@ -244,23 +246,41 @@ def test_a_population_that_misses_the_mode_is_replaced_by_evidence() -> None:
         torch.zeros(50).double(),
         falling_short(11.0),
     )
-    assert bool((second_search.searched(kept, around(-4.0))["x"] == -3.0).all())
+    assert bool((second_search.searched(kept, around(-4.0)).population["x"] == -3.0).all())
     near = weighted_at(
         astray,
         torch.zeros(50).double(),
         falling_short(2.0),
     )
-    assert second_search.searched(near, around(1.0)) is near
+    assert second_search.searched(near, around(1.0)) == (near, None)
     elsewhere = falling_short(2.0, misses=True)
-    joined = second_search.searched(weighted_at(astray, torch.zeros(50).double(), elsewhere), around(1.0))
+    joined, chosen = second_search.searched(
+        weighted_at(astray, torch.zeros(50).double(), elsewhere), around(1.0)
+    )
+    assert torch.equal(chosen < 50, joined["x"] == -3.0)
     assert 0 < int((joined["x"] == -3.0).sum()) < 50, "an estimate of 1 beside one of 0.24 keeps its share"
+
+
+def test_the_record_of_a_step_has_the_ancestors_after_a_second_search(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def always(population: Population, proposal: Any) -> second_search.Searched:
+        return second_search.joined_with_draws(population, population.approximation, proposal)
+
+    monkeypatch.setattr(guided_smc, "searched", always)
+    _, before, last = infer(model, world().look(), particles=30, seed=0)
+    taken = last.info.step.ancestors
+    old = taken >= 0
+    assert 0 < int(old.sum()) < 30, "some were drawn afresh"
+    assert torch.equal(last.population.founders[old], before.population.founders[taken[old]])
+    assert int(last.population.founders[~old].min()) > int(before.population.founders.max())
 
 
 def test_modes_that_particles_exceed_are_searched_for_again() -> None:
     better = falling_short(0.0)
     worse = SimpleNamespace(is_exceeded=lambda _: True, following=lambda _: better)
     population = weighted_at(torch.full((50,), 1.0).double(), torch.zeros(50).double(), worse)
-    after = second_search.searched(population, around(1.0))
+    after, _ = second_search.searched(population, around(1.0))
     assert after.approximation is better and torch.equal(after["x"], population["x"])
 
 

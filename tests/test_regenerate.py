@@ -58,3 +58,14 @@ def test_moves_by_regeneration_leave_the_posterior_as_it_is(mutant: str) -> None
     z_square = float((((trace["x"] - 0.5) ** 2).mean() - 0.5) / (0.5 * math.sqrt(2 / count)))
     worst = max(abs(z_mean), abs(z_square))
     assert worst > 8 if mutant else worst < 3.5, worst
+
+
+def test_what_is_impossible_before_and_after_stays_so() -> None:
+    """No particle's ratio is -inf minus -inf, as it is not of an update."""
+
+    def program() -> None:
+        x = pyro.sample("x", dist.Normal(number(0.0), 1.0))
+        pyro.sample("y", dist.Uniform(x.detach() + 10.0, x.detach() + 11.0, validate_args=False))
+
+    trace, _ = generate(program, (), {"y": number(0.0)}, N)
+    assert bool((regenerate(trace, "x").log_weight == -torch.inf).all())

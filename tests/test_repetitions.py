@@ -16,7 +16,7 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.distributions.poses import UniformPose
-from bcppl.errors import InputError, NoWeightError
+from bcppl.errors import InferenceError, InputError, NoWeightError
 from bcppl.inference.population import Population
 from bcppl.inference.repetitions import Repeated, repeated
 from bcppl.inference.summaries import mean
@@ -138,13 +138,13 @@ def test_runs_hang_on_the_seed_alone_and_the_last_step_counts() -> None:
     assert torch.equal(one.log_evidences, two.log_evidences)
     assert len(set(one.log_evidences.tolist())) == 3
     assert float(repeated(steps, 2).log_evidences.max()) < 1.0
-    for run, times, processes, said in (
+    for run, times, jobs, said in (
         (lambda seed: 3.0, 1, 1, "a float was given in place of a population"),
         (importance, 0, 1, "0 runs were asked for"),
         (lambda seed: importance(seed), 2, 2, "cannot be sent to another process"),
     ):
         with pytest.raises(InputError, match=said):
-            repeated(run, times, processes=processes)
+            repeated(run, times, jobs=jobs)
 
 
 PROGRAM = """
@@ -170,12 +170,24 @@ def test_processes_change_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.syspath_prepend(str(tmp_path))
     from a_program_of_its_own import run  # type: ignore[import-not-found]
 
-    one, two = repeated(run, 3, 4), repeated(run, 3, 4, processes=2)
+    one, two = repeated(run, 3, 4), repeated(run, 3, 4, jobs=2)
     assert torch.equal(one.log_evidences, two.log_evidences)
     for mine, other in zip(one.populations, two.populations, strict=True):
         assert torch.equal(mine.trace["x"], other.trace["x"])
         assert torch.equal(mine.trace.log_prob(), other.trace.log_prob())
     assert float(mean(one.pooled, "x")) == float(mean(two.pooled, "x"))
+
+
+def test_a_process_that_ends_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a_program_that_ends.py").write_text(
+        PROGRAM + "\n\ndef ends(seed):\n    import multiprocessing, os\n"
+        "    if multiprocessing.parent_process() is not None:\n        os._exit(3)\n    return run(seed)\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    from a_program_that_ends import ends  # type: ignore[import-not-found]
+
+    with pytest.raises(InferenceError, match=r"run 2 \(seed \d+\): its process"):
+        repeated(ends, 2, jobs=2)
 
 
 def test_a_dead_run_counts_as_no_evidence_and_is_named() -> None:

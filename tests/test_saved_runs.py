@@ -90,6 +90,25 @@ def pressed(stamps: Sequence[int]) -> None:
         pyro.sample(f"seen_{number}", ContactsInTime(track, first, last, 0.001, every=3))
 
 
+def test_a_fit_that_a_search_led_to_is_kept(tmp_path: Path) -> None:
+    """Made again from the image alone, it would be the one that was refuted."""
+    name = "guided, views and a touch"
+    _, model, recordings, _ = RUNS[name]
+    step, path = whole_run(name)[2], tmp_path / "step.h5"
+    approximation = step.population.approximation
+    fits = {
+        view: replace(each, fit=each.fit._replace(means=each.fit.means + 0.01))
+        for view, each in approximation.fits.items()
+    }
+    searched = replace(step, population=step.population.with_approximation(replace(approximation, fits=fits)))
+    saved.save_step(searched, path, recordings())
+    again = saved.load_step(path, model, recordings()).population.approximation
+    assert again.fits.keys() == fits.keys() and len(fits) == 2
+    for view, each in fits.items():
+        assert again.fits[view].action is not None
+        assert all(torch.equal(a, b) for a, b in zip(again.fits[view].fit, each.fit, strict=True))
+
+
 def test_what_was_simulated_so_far_is_kept(tmp_path: Path) -> None:
     """Not even a particle that diverged, and was run again at half the time step, is simulated again."""
     torch.manual_seed(0)

@@ -49,6 +49,9 @@ WALK = Series(
 )
 
 
+FORGETFUL = Series(WALK.init, WALK.step, history=False)
+
+
 def walked(state: Tensor) -> Tensor:
     state = pyro.sample("z", dist.Normal(0.9 * state, 0.8))
     pyro.sample("y", dist.Normal(state, 0.5))
@@ -121,6 +124,15 @@ def guided_step(trace: Trace) -> None:
     pyro.sample("z", dist.Normal(0.5 * trace["z"] + 0.5 * trace["y"], 0.7))
 
 
+def towards(population: Population) -> Callable[[Trace], None]:
+    share = 0.4 + 0.2 * float(torch.rand(()))
+
+    def program(trace: Trace) -> None:
+        pyro.sample("z", dist.Normal((1.0 - share) * trace["z"] + share * trace["y"], 0.7))
+
+    return program
+
+
 def learning(population: Population) -> Callable[[Trace], None]:
     center = float(torch.softmax(population.log_weights, 0) @ population.trace["x"])
 
@@ -155,6 +167,7 @@ STEPS: dict[str, tuple[Any, Pair, Callable[[], float]]] = {
     "auxiliary guess": (chain, Pair(guess, unguess), chain_evidence),
     "guided": (chain, Pair(guided, nothing, check=True), chain_evidence),
     "guided series": (WALK, Pair(guided_step, nothing, check=True), chain_evidence),
+    "guided series without history, in halves": (FORGETFUL, Pair(Fitted(towards), nothing), chain_evidence),
     "drawn from the model": (chain, Pair(nothing, nothing), chain_evidence),
 }
 

@@ -291,6 +291,9 @@ def test_what_cannot_be_trained_is_refused() -> None:
     def discrete(*args: Any) -> None:
         pyro.sample("x", dist.Bernoulli(logits=guide.gain + 0.0).mask(False).mask(True))
 
+    def broken(in_training: bool) -> Tensor:
+        return guide.gain * (torch.nan if guide.training is in_training else 1.0)
+
     def elsewhere(observed: Any) -> None:
         pyro.sample("z", dist.Normal(guide.gain, 1.0))
 
@@ -304,5 +307,6 @@ def test_what_cannot_be_trained_is_refused() -> None:
         train(guide, forward_kl(proposal, program, (), ["y"]), seed=-1)
     with pytest.raises(InputError, match="every 0 steps"):
         Checks(every=0)
-    with pytest.raises(InferenceError, match="loss of training is nan at step 1"):
-        train(guide, lambda: guide.gain * torch.nan, steps=1)
+    for step, in_training in ((1, True), (0, False)):  # of the draws that are held out
+        with pytest.raises(InferenceError, match=f"loss of training is nan at step {step}"):
+            train(guide, partial(broken, in_training), steps=1)

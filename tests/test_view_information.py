@@ -74,6 +74,29 @@ def test_the_cameras_error_bounds_its_information_and_a_second_image_adds_less()
     assert size[1] < size[2] and size[1] < size[0]
 
 
+def test_an_image_informs_as_much_as_its_likelihood_is_raised_to_a_power() -> None:
+    """By a camera that hardly errs, information is in proportion to that power."""
+    recording = bench_scene(2, part="square 8 mm").look()
+    view = recording.measurements[0].action
+    exact = {"camera_shift": 1e-9, "camera_turn": 1e-9, "bias": 1e-9, "bins": 3}
+    part = poses.as_pose(recording.guess.world_from_part)[None]
+
+    def informs(**power: float | None) -> torch.Tensor:
+        sensor = model.prepare(recording, **exact, **power).likelihoods["view"]
+        return sensor.information([], view, part)
+
+    whole = informs(effective_pixels=None, temperature=None)
+    compared = model.prepare(recording, **exact).likelihoods["view"].camera(view)
+    for pixels in (20.0, 200.0):
+        share = pixels / (compared.width * compared.height)
+        torch.testing.assert_close(
+            informs(effective_pixels=pixels, temperature=None), share * whole, rtol=1e-4, atol=1.0
+        )
+    torch.testing.assert_close(
+        informs(effective_pixels=None, temperature=4.0), 0.25 * whole, rtol=1e-4, atol=1.0
+    )
+
+
 def _error(sensor: ErringCamera, camera: Camera, part: torch.Tensor) -> torch.Tensor:
     return sensor.error.covariance([camera], part)
 

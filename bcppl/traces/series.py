@@ -294,13 +294,17 @@ class SeriesTrace(Trace):
     def revised(self, *args: Any, **options: Any) -> Trace:  # noqa: D102
         return super(SeriesTrace, self.settled()).revised(*args, **options)
 
+    @cached_property
+    def _forgotten(self) -> SeriesTrace:
+        """The state alone; of one trace the same one, so that steps that begin from it can be merged."""
+        return resumed(self.stage.series, self.state, self.steps, self.particles)
+
     def next_stage(self) -> Stage:
         """The step that comes after this trace's, for its particles."""
         whole, index = (self, None) if self.origin is None else self.origin
         series = self.stage.series
         if not series.history:
-            whole, index = Forgotten(Stage(series, self.steps), (), self.particles, {}, {}), None
-            whole.__dict__["_result"] = self.state
+            whole = whole._forgotten
         else:
             # The state is all that the next step needs: the distributions of a past step are released.
             whole.__dict__["_result"] = whole._result

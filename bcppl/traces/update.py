@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -16,7 +16,7 @@ from bcppl.traces.explained import other_addresses
 from bcppl.traces.series import SeriesTrace
 from bcppl.traces.trace import Trace
 from bcppl.traces.values import Value, tensors
-from bcppl.traces.verbs import constrained, copied, log_weight, refuse_unfit
+from bcppl.traces.verbs import constrained, copied, log_weight, refuse_no_trace, refuse_unfit
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,13 +45,18 @@ class Update:
         total = torch.zeros(new.particles, dtype=torch.float64)
         if others := set(changed(old, new, both)):
             named = [a for a in both if a in others or (a in old.known and a in new.known)]
-            now = new.log_prob(*named)
-            # What is impossible stays so: -inf minus -inf is no number.
-            total = total + torch.where(now == -torch.inf, now, now - old.log_prob(*named))
+            total = total + _log_ratio(new, old, named)
         added = [a for a in new.addresses if a not in old._run.distributions and a not in self.drawn]
         vanished = [a for a in old.addresses if a not in new._run.distributions]
         total = total + new.log_prob(*added) if added else total
         return total - old.log_prob(*vanished) if vanished else total
+
+
+def _log_ratio(new: Trace, old: Trace, addresses: Sequence[str]) -> Tensor:
+    """Log p(new trace) - log p(old trace), (N,), over sites of both."""
+    now = new.log_prob(*addresses)
+    # What is impossible stays so: -inf minus -inf is no number.
+    return torch.where(now == -torch.inf, now, now - old.log_prob(*addresses))
 
 
 def update(
@@ -78,6 +83,7 @@ def update(
             that is never visited; one has the wrong shape or type; new values change which addresses are
             visited, while the arguments stay; or a new latent pose lies in a plate.
     """
+    refuse_no_trace("update", trace)
     values, observations = tensors(values or {}), copied(observations or {})
     old = {**trace.choices, **trace.observations}
     replaced = {a: v for a, v in values.items() if a in old or args is None}
@@ -123,6 +129,7 @@ def extend(
         InputError: an address vanishes, or an observation or a choice is of an old address, of one never
             visited, or of the wrong shape, or a new latent pose lies in a plate.
     """
+    refuse_no_trace("extend", trace)
     choices = choices or {}
     if isinstance(trace, SeriesTrace):
         stage = trace.next_stage()
@@ -162,11 +169,10 @@ class Regenerated:
 
         It is log p(new trace) - log p(old trace) over the sites that were not regenerated.
         """
-        total = torch.zeros(self.trace.particles, dtype=torch.float64)
         others = [address for address in self.trace.addresses if address not in self.discarded]
-        for address in changed(self.previous, self.trace, others):
-            total = total + self.trace.log_prob(address) - self.previous.log_prob(address)
-        return total
+        if others := list(changed(self.previous, self.trace, others)):
+            return _log_ratio(self.trace, self.previous, others)
+        return torch.zeros(self.trace.particles, dtype=torch.float64)
 
 
 def regenerate(trace: Trace, addresses: str | Collection[str]) -> Regenerated:
@@ -177,5 +183,6 @@ def regenerate(trace: Trace, addresses: str | Collection[str]) -> Regenerated:
     Raises:
         InputError: an address is not latent, or the values change which addresses are visited.
     """
+    refuse_no_trace("regenerate", trace)
     addresses = [addresses] if isinstance(addresses, str) else list(addresses)
     return Regenerated(trace.regenerated(addresses), trace, {a: trace.choices[a] for a in addresses})

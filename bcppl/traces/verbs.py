@@ -29,6 +29,13 @@ from bcppl.traces.values import Value, held, shapes, tensors
 FEW = 20
 
 
+def refuse_no_trace(where: str, given: Any) -> None:
+    """Refuse what is no trace."""
+    if not isinstance(given, Trace):
+        own = f"; of particles with weights, bcppl.inference.{where}" if hasattr(given, "trace") else ""
+        raise InputError(f"{where} is given a {type(given).__name__} in place of a trace{own}.")
+
+
 def simulate(program: Program | Series, args: tuple[Any, ...] = (), particles: int = 1) -> Trace:
     """Run a program forward: every site is sampled, those that would be observed included.
 

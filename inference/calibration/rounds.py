@@ -22,14 +22,14 @@ Arrays = Mapping[str, npt.NDArray[Any]]
 
 
 def gathered(
-    job: Callable[[int], Result], seeds: Sequence[int], processes: int = 1, progress: bool = True
+    job: Callable[[int], Result], seeds: Sequence[int], jobs: int = 1, progress: bool = True
 ) -> Iterator[tuple[int, Result]]:
     """The number of each seed and `job(seed)`, in the order in which they end.
 
     Args:
         job: of a seed.
         seeds: of the rounds.
-        processes: above 1, others than this one, of one thread each.
+        jobs: how many at a time: above 1 in other processes, of one thread each.
         progress: show a bar, on a terminal or in a notebook.
 
     Raises:
@@ -37,7 +37,7 @@ def gathered(
         InferenceError: a process has ended.
     """
     numbered = list(enumerate(seeds))
-    ending = as_they_end(partial(_of_seed, job), numbered, processes)
+    ending = as_they_end(partial(_of_seed, job), numbered, jobs)
     for (number, seed), result in watched(
         ending, total=len(numbered), description="rounds", progress=progress
     ):

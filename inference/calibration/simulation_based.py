@@ -11,8 +11,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -44,7 +43,7 @@ def calibrate(
     *,
     posterior_draws: int = 49,
     seed: int = 0,
-    processes: int = 1,
+    jobs: int = 1,
     folder: str | os.PathLike[str] | None = None,
 ) -> Calibration:
     """Ranks, coverage and the data-averaged posterior of an inference, over draws of the joint distribution.
@@ -58,7 +57,7 @@ def calibrate(
         posterior_draws: L, among which each truth is ranked. They are resampled from the weighted particles,
             of which there should be at least twice as many; copies of one particle are too alike, and show.
         seed: of all; torch's own generator is left as it was. More draws continue the same ones.
-        processes: above 1, rounds are distributed over so many others, of one thread each.
+        jobs: how many rounds at a time: above 1 in so many other processes, of one thread each.
         folder: each round is kept in a file there; a call that was interrupted, or is to have more draws,
             goes on from them. The first of them is made again, to see that it is of this inference.
 
@@ -75,7 +74,7 @@ def calibrate(
         )
     draws = whole_number("a calibration of {} draws was asked for", draws)
     ranked = whole_number("truths are to be ranked among {} draws", posterior_draws)
-    processes = whole_number("rounds in {} processes were asked for", processes)
+    jobs = whole_number("{} rounds at a time were asked for", jobs)
     seeds = [int(s) for s in np.random.SeedSequence(seed_number(seed)).generate_state(draws)]
     path = None if folder is None else _prepared(Path(folder), seed, ranked)
     done = {} if path is None else {k: arrays for k in range(draws) if (arrays := kept(_file(path, k)))}
@@ -84,7 +83,7 @@ def calibrate(
     if done:
         first = min(done)
         _refuse_other(Path(folder or ""), done[first], job(seeds[first]))
-    for number, arrays in gathered(job, [seeds[k] for k in missing], min(processes, max(1, len(missing)))):
+    for number, arrays in gathered(job, [seeds[k] for k in missing], min(jobs, max(1, len(missing)))):
         done[missing[number]] = arrays
         if path is not None:
             keep(_file(path, missing[number]), arrays)
@@ -186,8 +185,5 @@ class Round:
 
 
 def _inferred(inference: Inference, data: Any) -> Population:
-    result = inference(data)
-    if isinstance(result, Iterator):
-        last = deque(result, maxlen=1)
-        result = last[0] if last else None
-    return population_of(result, "an inference that returns one, a step of SMC, or an iterator over those")
+    asked = "an inference that returns one, a step of SMC, or an iterator over those"
+    return population_of(inference(data), asked)

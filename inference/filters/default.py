@@ -6,11 +6,11 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
+from inspect import signature
 from typing import Any
 
 from bcppl.errors import InputError
-from bcppl.inference.filters.smc import Step
-from bcppl.recordings import Recording
+from bcppl.inference.filters.smc import Step, refuse_no_recording
 from bcppl.traces import Model
 
 Infer = Callable[..., Iterator[Step]]
@@ -41,14 +41,15 @@ def infer(model: Model, recording: Any, **settings: Any) -> Iterator[Step]:
             in place of the model's own: `particles`, `seed`, `scene`, `start` and others.
 
     Raises:
-        InputError: what is given is no model or no recording, a setting is out of range, or the recording
-            does not fit the model.
+        InputError: what is given is no model or no recording, a setting is unknown or out of range, or the
+            recording does not fit the model.
         InferenceError: no particle is left with any weight.
     """
-    program = default_inference(model)[1]
-    if not isinstance(recording, Recording):
-        raise InputError(
-            f"inference is given a {type(recording).__name__} in place of a recording; "
-            "read one with bcppl.load."
-        )
+    name, program = default_inference(model)
+    refuse_no_recording(recording)
+    known = signature(program).parameters
+    for setting in settings:
+        if setting not in known:
+            own = [each for each in known if each not in ("model", "recording")]
+            raise InputError(f"{name} has no setting {setting!r}; its settings are {', '.join(own)}.")
     return program(model, recording, **settings)

@@ -31,10 +31,10 @@ from bcppl.inference.approximations.approximation import Approximation
 from bcppl.inference.approximations.gaussian import GaussianApproximation
 from bcppl.inference.filters.assimilation import Assimilated, assimilate, assimilate_screened
 from bcppl.inference.filters.screening import approximated, by_mode
-from bcppl.inference.filters.second_search import searched
+from bcppl.inference.filters.second_search import Searched, searched
 from bcppl.inference.filters.smc import Step, smc
 from bcppl.inference.filters.smcp3 import Pair
-from bcppl.inference.filters.step import Observed, StepFunction, StepInfo, Stepped
+from bcppl.inference.filters.step import Observed, StepFunction, StepInfo, Stepped, descended
 from bcppl.inference.filters.tempering import resample_move, tempered
 from bcppl.inference.filters.view_search import is_refuted, searched_by_climbing
 from bcppl.inference.kernels import Kernel, cycle, metropolis_hastings, sequence, surrogate_transition
@@ -126,7 +126,7 @@ def guided(
     sweeps: int | Until = 1,
     share: float = 0.5,
     screen: bool = True,
-    search: Callable[[Population, Trace], Population] | None = None,
+    search: Callable[[Population, Trace], Searched] | None = None,
 ) -> StepFunction:
     """A step that assimilates a measurement by SMCP3, resamples when needed, and moves the particles.
 
@@ -138,7 +138,7 @@ def guided(
         share: particles are resampled below this effective sample size, as a share of N.
         screen: whether a cheap likelihood of what is simulated chooses among copies of the particles.
         search: given the population after each step and the trace before it, returns that population or
-            another that takes its place.
+            another that takes its place, and where its particles come from.
     """
 
     def resample(population: Population) -> tuple[Population, Tensor | None]:
@@ -178,11 +178,19 @@ def guided(
 
     def settled(stepped: Stepped, before: Trace) -> Stepped:
         population, info = stepped
-        other = population if search is None else search(population, before)
+        other, chosen = Searched(population) if search is None else search(population, before)
         if other is population:
             return stepped
+        if chosen is not None:
+            info = info._replace(
+                resampled=info.resampled + 1,
+                effective_sample_size_before=population.effective_sample_size,
+                ancestors=descended(info.ancestors, chosen, len(population)),
+            )
         gained = other.log_evidence - population.log_evidence
-        other = rejuvenation(other, POSTERIOR).population
+        other = rejuvenation(
+            other, POSTERIOR
+        ).population  # nothing is resampled: all weigh alike, or as before
         size = other.effective_sample_size
         return Stepped(
             other, info._replace(log_evidence=info.log_evidence + gained, effective_sample_size=size)
@@ -291,7 +299,7 @@ def infer(
         again: GaussianApproximation = _given_all(replace(gaussian(scene), near=near), trace, actions)
         return replace(again, near=None)
 
-    def search(population: Population, before: Trace) -> Population:
+    def search(population: Population, before: Trace) -> Searched:
         scene, actions = population.trace.args
         if isinstance(scene.sensor(actions[-1]), FitsPose):
             new = population.trace.since(before)

@@ -40,7 +40,6 @@ def screened(
     before: Any,
     observed: Observed,
     pair: Pair,
-    copies: int = COPIES,
 ) -> tuple[Population, Tensor] | None:
     """N particles given one more measurement, of copies that the cheap target has weighted.
 
@@ -49,7 +48,6 @@ def screened(
         before: the approximation that is not.
         observed: the measurement; latent values that come with it are drawn from the program.
         pair: moves a particle.
-        copies: of each particle.
 
     Returns:
         The population, and which particle each was made of; None where none keeps any weight.
@@ -61,14 +59,14 @@ def screened(
         # What came with the measurement was drawn from the program.
         return now - then - (updated.trace.log_prob(*updated.drawn) if updated.drawn else 0.0)
 
-    many = replicate(population, copies)
+    many = replicate(population, COPIES)
     try:
         by_cheap = moved(many, pair, observed, ratio)
         chosen = by_mode(by_cheap, len(population))
         few, old = by_cheap.selected(chosen), many.trace[chosen]
         drawn = frozenset(address for address in few.trace.choices if address not in old.choices)
         change = Update(few.trace, old, {}, drawn)
-        return few.reweighed(change.log_ratio - ratio(change)), chosen // copies
+        return few.reweighed(change.log_ratio - ratio(change)), chosen // COPIES
     except NoWeightError:
         return None
 
@@ -77,7 +75,6 @@ def screened_draws(
     trace: Trace,
     approximation: Any,
     proposal: Callable[..., Any],
-    copies: int = COPIES,
 ) -> Population:
     """As many particles as a trace has, of draws of a proposal that the cheap target has weighted.
 
@@ -85,12 +82,11 @@ def screened_draws(
         trace: the program, its arguments and its observations.
         approximation: given all of these.
         proposal: of all latent values.
-        copies: draws for each particle.
 
     Raises:
         NoWeightError: none has any weight.
     """
-    count = copies * trace.particles
+    count = COPIES * trace.particles
     proposed = propose(proposal, trace.args, count)
     drawn, _ = constrained(trace.program, trace.args, count, trace.observations, proposed.choices)
     log_weights = _cheap_log_density(drawn, approximation) - proposed.log_prob

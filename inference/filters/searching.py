@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from bcppl.beliefs import normalised
-from bcppl.inference.filters.step import Observed, StepFunction, StepInfo, Stepped
+from bcppl.inference.filters.step import Observed, StepFunction, StepInfo, Stepped, descended
 from bcppl.inference.importance import importance_sampling
 from bcppl.inference.kernels import Kernel, Until, moved_by
 from bcppl.inference.kernels.kernel import scattered
@@ -122,15 +122,14 @@ def _reweighed(population: Population, observed: Observed) -> Stepped:
 
 
 def _record(done: Stepped, before: Population, moved: Moved, chosen: Tensor) -> StepInfo:
-    info, count = done.info, len(before)
-    descent = torch.arange(count) if info.ancestors is None else info.ancestors
+    info = done.info
     return info._replace(
         acceptance=moved.acceptance,
         resampled=info.resampled + 1,
         effective_sample_size_before=done.population.effective_sample_size,
         effective_sample_size=moved.population.effective_sample_size,
         log_evidence=moved.population.log_evidence - before.log_evidence,
-        ancestors=torch.where(chosen < count, descent[chosen.clamp(max=count - 1)], -1),
+        ancestors=descended(info.ancestors, chosen, len(before)),
     )
 
 

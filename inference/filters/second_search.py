@@ -10,7 +10,9 @@ it is needed, the evidence is consistent rather than unbiased.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
+
+from torch import Tensor
 
 from bcppl.errors import NoWeightError
 from bcppl.inference.filters.screening import screened_draws
@@ -23,7 +25,14 @@ MISSED = 10.0  # nats by which a mode is better than half of the particles: in s
 COPIES = 20  # draws for each particle: the approximation leaves some per cent of them effective
 
 
-def searched(population: Population, proposal: Callable[[Any], Callable[..., Any]]) -> Population:
+class Searched(NamedTuple):
+    """The population after a search, and which particles (N,) of `joined` it has; None for those before."""
+
+    population: Population
+    chosen: Tensor | None = None
+
+
+def searched(population: Population, proposal: Callable[[Any], Callable[..., Any]]) -> Searched:
     """The population, or one joined with draws of its approximation where that explains all far better.
 
     So it is where no particle is near a mode that is about as probable: particles that all went to another
@@ -41,8 +50,9 @@ def searched(population: Population, proposal: Callable[[Any], Callable[..., Any
     population = _followed(population)
     approximation, trace = population.approximation, population.trace
     if approximation.shortfall(trace) < MISSED and not approximation.misses_a_mode(trace):
-        return population
-    return _followed(joined_with_draws(population, approximation, proposal))
+        return Searched(population)
+    other, chosen = joined_with_draws(population, approximation, proposal)
+    return Searched(_followed(other), chosen)
 
 
 def _followed(population: Population) -> Population:
@@ -55,7 +65,7 @@ def _followed(population: Population) -> Population:
 
 def joined_with_draws(
     population: Population, approximation: Any, proposal: Callable[[Any], Callable[..., Any]]
-) -> Population:
+) -> Searched:
     """The population, joined with one drawn from an approximation by their evidence.
 
     Args:
@@ -73,5 +83,7 @@ def joined_with_draws(
             )
         both, chosen = joined(population, drawn)
     except NoWeightError:
-        return population
-    return both.with_approximation(approximation) if bool((chosen >= len(population)).any()) else both
+        return Searched(population)
+    if bool((chosen >= len(population)).any()):
+        both = both.with_approximation(approximation)
+    return Searched(both, chosen)

@@ -28,7 +28,7 @@ from bcppl.devices import (
     set_random_state,
 )
 from bcppl.errors import InferenceError, InputError
-from bcppl.inference.filters.step import Observed, StepFunction, StepInfo
+from bcppl.inference.filters.step import Observed, StepFunction, StepInfo, refuse_no_step
 from bcppl.inference.filters.tempering import tempered
 from bcppl.inference.population import Population
 from bcppl.inference.progress import watched
@@ -154,9 +154,9 @@ def smc(
 
     Raises:
         InferenceError: no particle is left with any weight; names the measurement.
-        InputError: the particles or the seed are no whole number, the program samples no pose at
-            `model.pose`, `start` has assimilated more measurements than there are or was made on another
-            device, or there is no such device.
+        InputError: what is given is no step or no recording, the particles or the seed are no whole number,
+            the program samples no pose at `model.pose`, `start` has assimilated more measurements than there
+            are or was made on another device, or there is no such device.
 
     Warns:
         RuntimeWarning: the recording has a problem (`bcppl.recordings.problems`, checked where no scene is
@@ -164,12 +164,22 @@ def smc(
             `bcppl run` refuses such a recording. Or a measurement repeats an earlier one, number by number:
             it is counted once.
     """
+    refuse_no_step("smc", step)
+    refuse_no_recording(recording)
     whole_number("SMC is to run {} particles", particles)
     seed_number(seed)
     recording = once_each(recording) if isinstance(recording, Recording) else recording
     steps = _steps(model, recording, step, particles, seed, scene, start, device_named(device))
     left = len(recording.measurements) + (1 if start is None else -start.taken)
     return watched(steps, total=left, describe=lambda each: each.info.label, progress=progress)
+
+
+def refuse_no_recording(given: object) -> None:
+    """Refuse what has no measurements, such as the path of a recording."""
+    if not hasattr(given, "measurements"):
+        raise InputError(
+            f"inference is given a {type(given).__name__} in place of a recording; read one with bcppl.load."
+        )
 
 
 def _warn_of_problems(recording: Any) -> None:

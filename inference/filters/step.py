@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
 from typing import Any, NamedTuple
 
+import torch
 from torch import Tensor
 
 from bcppl.errors import InputError
@@ -45,8 +46,8 @@ class StepInfo(NamedTuple):
         effective_sample_size_before: just before the last resampling; where there was none, at the end.
         effective_sample_size: at the end.
         log_evidence: the increment of the log evidence.
-        ancestors: (N,) int64, the particle before the step that each one descends from; None where
-            nothing was resampled, and each descends from itself.
+        ancestors: (N,) int64, the particle before the step that each one descends from, -1 for one that was
+            drawn afresh; None where nothing was resampled, and each descends from itself.
         displacement: mean squared displacement of the particles since the last resampling, in variances, on
             the axis on which it is least; NaN without resampling, or without `until(displacement=...)`.
     """
@@ -69,6 +70,20 @@ class StepInfo(NamedTuple):
         return f"StepInfo({', '.join(f'{name}={shown[name]}' for name in self._fields if name in shown)})"
 
 
+def descended(ancestors: Tensor | None, chosen: Tensor | None, count: int) -> Tensor | None:
+    """The ancestors of particles that are chosen once more from `count` of them.
+
+    Args:
+        ancestors: (count,) of those, as of `StepInfo`.
+        chosen: (N,) int64 among those; from `count` on, particles drawn afresh. None for all, in order.
+        count: how many there were.
+    """
+    if chosen is None:
+        return ancestors
+    first = torch.arange(count) if ancestors is None else ancestors
+    return torch.where(chosen < count, first[chosen.clamp(max=count - 1)], -1)
+
+
 class Stepped(NamedTuple):
     """A population that has assimilated observations, and the record of the step."""
 
@@ -77,6 +92,15 @@ class Stepped(NamedTuple):
 
 
 StepFunction = Callable[[Population, Observed], Stepped]
+
+
+def refuse_no_step(where: str, step: object) -> None:
+    """Refuse what cannot be a step."""
+    if not callable(step) or not takes(step, 2):
+        raise InputError(
+            f"{where} is given something else than a step; if it is a kernel, give tempered(kernel) from "
+            "bcppl.inference.filters.tempering."
+        )
 
 
 def steps(
@@ -96,11 +120,7 @@ def steps(
     Raises:
         InputError: what is given is no step (a kernel, say), no population, or no list of `Observed`.
     """
-    if not callable(step) or not takes(step, 2):
-        raise InputError(
-            "steps is given something else than a step; if it is a kernel, give tempered(kernel) from "
-            "bcppl.inference.filters.tempering."
-        )
+    refuse_no_step("steps", step)
     refuse_no_population("steps", population)
     if isinstance(observed, Observed):
         raise InputError("steps is given one Observed; give a list of them, one for each step.")

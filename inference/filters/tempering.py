@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import NamedTuple
 
 import torch
@@ -23,7 +22,7 @@ from torch import Tensor
 
 from bcppl.arguments import number_within, whole_number
 from bcppl.errors import InputError
-from bcppl.inference.exponents import next_exponent, resampled_below
+from bcppl.inference.exponents import fixed_exponents, next_exponent, resampled_below
 from bcppl.inference.filters.step import Observed, StepInfo, Stepped
 from bcppl.inference.kernels import Kernel, Until, moved_by
 from bcppl.inference.kernels.kernel import refuse_other
@@ -100,8 +99,6 @@ class _Schedule(NamedTuple):
         if self.fixed is not None:
             return next(e for e in self.fixed if e > reached)
         kept = kept_share(self.share(population.trace)) if callable(self.share) else self.share
-        if kept <= 0.0:
-            return 1.0
         return next_exponent(population.log_weights, log_likelihood, reached, kept)
 
 
@@ -221,13 +218,7 @@ def tempered(
     if not callable(sweeps) and not isinstance(sweeps, Until):
         # Without moves there is no kernel: None.
         sweeps = whole_number("tempering is to move the particles in {} sweeps", sweeps)
-    fixed = None
-    if exponents is not None:
-        fixed = tuple(number_within("tempering is given the exponent {}", e) for e in exponents)
-    if fixed is not None and (fixed[-1:] != (1.0,) or any(b <= a for a, b in pairwise((0.0, *fixed)))):
-        raise InputError(
-            f"tempering is given the exponents {list(fixed)}; give increasing ones that end with 1."
-        )
+    fixed = None if exponents is None else fixed_exponents(exponents)
     if resample is not None:
         check_resample("tempered", resample)
     if rejuvenation is None:

@@ -23,7 +23,7 @@ from bcppl.distributions.depth import DepthDistribution
 from bcppl.distributions.support import freedom_of
 from bcppl.errors import NoWeightError
 from bcppl.inference.criticism.predictive import THRESHOLD, surprise
-from bcppl.inference.filters.second_search import joined_with_draws
+from bcppl.inference.filters.second_search import Searched, joined_with_draws
 from bcppl.inference.population import Population
 from bcppl.inference.proposals.climbing import modes
 from bcppl.traces import Trace, generate
@@ -50,7 +50,7 @@ def searched_by_climbing(
     pose: str,
     approximated: Callable[[Trace, torch.Tensor], Any],
     proposal: Callable[[Any], Callable[..., Any]],
-) -> Population:
+) -> Searched:
     """The population, joined by evidence with one about the modes that climbs lead to.
 
     Args:
@@ -68,5 +68,5 @@ def searched_by_climbing(
     try:
         ends = modes(climbers, pose, along)
     except NoWeightError:
-        return population
+        return Searched(population)
     return joined_with_draws(population, approximated(trace, ends.centers), proposal)

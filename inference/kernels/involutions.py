@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from functools import partial
 
+import torch
 from torch import Tensor
 
 from bcppl.errors import InputError
@@ -84,7 +85,9 @@ def involutive(program: Proposal, involution: Involution, *, check: bool = False
             refuse_observed("the program of an involution", forward.choices, updated.trace)
             choices = {a: v for (kind, a), v in after.items() if kind == "choice"}
             reverse = assess(choose, (visible(target, updated.trace),), choices, count)
-            log_ratio = reverse - forward.log_prob() + log_forward
+            chosen = forward.log_prob()
+            # A choice to which its own program gives no density has left the range of its type.
+            log_ratio = torch.where(chosen == -torch.inf, -torch.inf, reverse - chosen + log_forward)
             return decided(target, trace, updated.trace, log_ratio)
 
         return move

@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.nn import Module
 
 from bcppl.arguments import seed_number, whole_number
+from bcppl.devices import seed_here
 from bcppl.errors import InferenceError, InputError
 from bcppl.inference.learning.objectives import Objective
 from bcppl.inference.progress import watched
@@ -105,7 +106,7 @@ def train(
 
     Raises:
         InputError: there is no parameter that asks for gradients, or the loss depends on none.
-        InferenceError: the loss is not finite.
+        InferenceError: the loss, or that of held-out draws, is not finite.
     """
     modules, tensors = _listed(parameters)
     steps = whole_number("training is to make {} steps", steps)
@@ -113,10 +114,10 @@ def train(
     begun = time.perf_counter()
     losses: list[float] = []
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
+        seed_here(seed)
         optimiser_ = optimiser(tensors)
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser_, steps)
-        record = [(0, _held_out(objective, modules, checks, seed))]
+        record = [(0, _finite(_held_out(objective, modules, checks, seed), 0))]
         best, kept = record[0], _values(modules, tensors)
         for number in watched(range(1, steps + 1), description="training", progress=progress):
             optimiser_.zero_grad()
@@ -132,7 +133,7 @@ def train(
             schedule.step()
             if number % checks.every and number < steps:
                 continue
-            record.append((number, _held_out(objective, modules, checks, seed)))
+            record.append((number, _finite(_held_out(objective, modules, checks, seed), number)))
             if record[-1][1] < best[1]:
                 best, kept = record[-1], _values(modules, tensors)
             late = sum(1 for made, _ in record if made > best[0])
@@ -172,7 +173,7 @@ def _finite(loss: float, number: int) -> float:
 def _held_out(objective: Objective, modules: list[Module], checks: Checks, seed: int) -> float:
     """The mean loss of some batches, drawn in the same way each time."""
     with torch.random.fork_rng(devices=[]), _evaluating(modules):
-        torch.manual_seed(seed ^ HELD_OUT)
+        seed_here(seed ^ HELD_OUT)
         return sum(float(objective().detach()) for _ in range(checks.batches)) / checks.batches
 
 

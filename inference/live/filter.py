@@ -128,15 +128,16 @@ class Filter:
         Windows of a probe may arrive in any order, and wait for those before them.
 
         Raises:
-            InputError: the measurement has a problem.
+            InputError: the measurement has a problem, or the filter is closed.
             InferenceError: an earlier one has ended the filter (`on_fault="stop"`).
+            Exception: `on_update` has raised it, which ends the filter.
         """
         measurement = Measurement(action, observation)
         self._refuse(measurement)
         with self._changed:
             self._raise_failure()
             self._waiting.add(measurement, time.monotonic())
-        self._thread.submit(self._assimilate)
+        self._submit(self._assimilate)
 
     # ---- what is known
 
@@ -289,7 +290,10 @@ class Filter:
                 taken = self._waiting.take(join=late)
             if taken is None:
                 return
-            self._update(*taken)
+            try:
+                self._update(*taken)
+            except Exception as error:  # of a callback as well: the next call of `observe` or `settle` has it
+                self._failed = error
 
     def _update(self, measurement: Measurement, arrived: float, joined: int) -> None:
         before, count = self._step, self._affordable(joined)
@@ -308,9 +312,6 @@ class Filter:
                 self._failed = error
             else:
                 warnings.warn(f"{fault.rstrip('.')}: it is left out.", RuntimeWarning, stacklevel=1)
-        except Exception as error:
-            self._failed = error
-            raise
         update = Update(joined, count, time.monotonic() - arrived, fault)
         with self._changed:
             self._updates.append(update)
@@ -331,8 +332,13 @@ class Filter:
         return last.particles
 
     def _run(self, what: Callable[[], T], timeout: float | None) -> T:
-        done: Future[T] = self._thread.submit(what)
-        return done.result(timeout)
+        return self._submit(what).result(timeout)
+
+    def _submit(self, what: Callable[[], T]) -> Future[T]:
+        try:
+            return self._thread.submit(what)
+        except RuntimeError as error:
+            raise InputError("the live filter is closed; begin another with its recording.") from error
 
     def _raise_failure(self) -> None:
         if self._failed is not None:

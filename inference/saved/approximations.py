@@ -1,7 +1,7 @@
 """The approximation that guides a filter as plain data, and made again for a trace.
 
-The fits of images are computed again: they depend on the image alone. The quadratic approximation depends on
-the order in which measurements were assimilated, and is kept.
+It is kept whole: a quadratic approximation depends on the order in which measurements were assimilated, and
+the fit of an image on whether modes were searched for.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+from bcppl.distributions.fitted import FittedMixture
 from bcppl.errors import InputError
 from bcppl.inference.approximations.fits import Fitted
 from bcppl.inference.approximations.gaussian import GaussianApproximation
@@ -36,7 +37,7 @@ def approximation_content(approximation: Any) -> Content | None:
     relevant = approximation.relevant
     return {
         "pose": approximation.pose,
-        "fits": list(approximation.fits),
+        "fits": {name: list(each.fit) for name, each in approximation.fits.items()},
         "contacts": [contact.number for contact in approximation.contacts],
         "quadratic": None if approximation.quadratic is None else list(approximation.quadratic),
         "adapted": None if approximation.adapted is None else list(approximation.adapted),
@@ -55,7 +56,9 @@ def approximation_of(content: Content | None, trace: Trace) -> GaussianApproxima
         return None
     try:
         scene, actions = trace.args
-        fits = {name: _fitted(name, scene, actions, trace) for name in content["fits"]}
+        held = content["fits"]  # files of before they were kept have names alone
+        known = held if isinstance(held, dict) else dict.fromkeys(held)
+        fits = {name: _fitted(name, fit, scene, actions, trace) for name, fit in known.items()}
         contacts = tuple(_contact(number, scene, actions, trace) for number in content["contacts"])
     except (ValueError, LookupError, TypeError, AttributeError) as error:
         raise InputError(
@@ -75,11 +78,13 @@ def approximation_of(content: Content | None, trace: Trace) -> GaussianApproxima
     )
 
 
-def _fitted(name: str, scene: Any, actions: Sequence[Any], trace: Trace) -> Fitted:
+def _fitted(name: str, known: Any, scene: Any, actions: Sequence[Any], trace: Trace) -> Fitted:
     for number, action in enumerate(actions):
         sensor = scene.sensor(action)
         if isinstance(sensor, FitsPose) and sensor.viewpoint(action) == name:
-            return Fitted(action, sensor.fit(number, action, trace.observations))
+            again = known is None
+            fit = sensor.fit(number, action, trace.observations) if again else FittedMixture(*known)
+            return Fitted(action, fit)
     raise LookupError(f"no measurement by {name!r}")
 
 

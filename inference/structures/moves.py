@@ -14,6 +14,8 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
+import torch
+
 from bcppl.arguments import whole_number
 from bcppl.errors import InputError
 from bcppl.inference.kernels import Kernel, Move, Until, moved_by
@@ -96,7 +98,9 @@ def in_turn(*moves: StrataMove, times: int = 1) -> StrataMove:
                 strata, acceptance = each(strata, target)
                 made += acceptance
             shares.append(made)
-        return MovedStrata(strata, tuple(sum(each) / times for each in zip(*shares, strict=True)))
+        # A jump that nobody made in a round has no share of it.
+        each_round = torch.tensor(shares, dtype=torch.float64)
+        return MovedStrata(strata, tuple(each_round.nanmean(dim=0).tolist()))
 
     return move
 

@@ -14,15 +14,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from bcppl.arguments import number_within, whole_number
-from bcppl.errors import InputError
-from bcppl.inference.exponents import next_exponent, resampled_below
+from bcppl.inference.exponents import fixed_exponents, next_exponent, resampled_below
 from bcppl.inference.filters.step import Observed
 from bcppl.inference.filters.tempering import kept_share, ratio_of_old_sites
 from bcppl.inference.resampling import Scheme, systematic
@@ -183,8 +181,6 @@ class TemperedStrata:
         """The exponent that follows `reached`."""
         if self.exponents is not None:
             return next(e for e in self.exponents if e > reached)
-        if self.share <= 0.0:
-            return 1.0
         together = torch.cat([log_likelihoods[s] for s in strata.populations])
         return next_exponent(strata.log_weights, together, reached, self.share)
 
@@ -216,13 +212,7 @@ def tempered_strata(
     """
     if move is not None:
         refuse_no_move("tempered_strata", move)
-    fixed = None
-    if exponents is not None:
-        fixed = tuple(number_within("tempering is given the exponent {}", e) for e in exponents)
-        if fixed[-1:] != (1.0,) or any(b <= a for a, b in pairwise((0.0, *fixed))):
-            raise InputError(
-                f"tempering is given the exponents {list(fixed)}; give increasing ones that end with 1."
-            )
+    fixed = None if exponents is None else fixed_exponents(exponents)
     kept = kept_share(share)
     return TemperedStrata(
         move,

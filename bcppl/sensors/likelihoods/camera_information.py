@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -20,14 +20,15 @@ def information_of_images(
     part: Tensor,
     settings: CameraSettings,
     error: InstrumentError,
+    valid: Callable[[Camera], int],
 ) -> Tensor:
     """The information (N, 6, 6) of images about a part at poses (N, 7); range bias and errors integrated out.
 
-    `cameras` are the viewpoints of one instrument, one for each image; `error` is that of its pose.
+    `cameras` are the viewpoints of one instrument, one for each image; `error` is that of its pose, and
+    `valid` the number of pixels of an image that count.
     """
     if not cameras:
         return torch.zeros(len(part), 6, 6, dtype=torch.float64)
-    weight = (1.0 - settings.outlier) / settings.scale**2 / (settings.temperature or 1.0)
     places = {place_of(camera): camera for camera in cameras}
     count = len(places)
     seen = torch.zeros(len(part), 6 * count, 6 * count, dtype=torch.float64)
@@ -36,7 +37,9 @@ def information_of_images(
     for camera in cameras:
         place = list(places).index(place_of(camera))
         rows = slice(6 * place, 6 * place + 6)
-        pixels = weight * pixel_information(renderer, camera, part, settings.bins)
+        pixels = settings.pixel_weight(valid(camera)) * pixel_information(
+            renderer, camera, part, settings.bins
+        )
         seen[:, rows, rows] += pixels[:, :6, :6]
         both[:, rows, place] += pixels[:, :6, 6]
         own[:, place, place] += pixels[:, 6, 6]

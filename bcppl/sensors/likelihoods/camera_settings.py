@@ -45,6 +45,16 @@ class CameraSettings:
     def __post_init__(self) -> None:
         check_parameters(self)
 
+    def pixel_weight(self, valid: int) -> float:
+        """The Fisher information about its depth of one of so many pixels of an image that count, 1/m^2.
+
+        That of the Laplace law where the part is seen, by the power to which the likelihood is raised.
+        """
+        power = 1.0 / (self.temperature or 1.0)
+        if self.effective_pixels is not None:
+            power = min(1.0, self.effective_pixels / max(valid, 1))
+        return power * (1.0 - self.outlier) / self.scale**2
+
     def bias_covariance(self, count: int) -> Tensor:
         """The covariance (K, K) of the biases at K viewpoints of one instrument, m^2."""
         common = 1.0 - self.viewpoint**2

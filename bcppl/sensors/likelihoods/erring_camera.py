@@ -255,17 +255,22 @@ class ErringCamera:
     def information(self, done: Sequence[Any], action: View, part: Tensor) -> Tensor:
         """The information (N, 6, 6) that an image adds to the part's pose (N, 7) after `done`.
 
-        Pixels are weighted as by `RobustDepth`; range bias and extrinsic error are integrated out. Images of
-        one instrument share the bias and most of the error, so the tenth adds less than the first. It is
-        information about one mode: it does not discriminate between modes.
+        Pixels are weighted as by `RobustDepth` where none is missing; range bias and extrinsic error are
+        integrated out. Images of one instrument share the bias and most of the error, so the tenth adds less
+        than the first. It is information about one mode: it does not discriminate between modes.
         """
         views = [a.camera for a in done if isinstance(a, View)]
         before = [camera for camera in views if camera.instrument == action.camera.instrument]
         both, alone = (
-            information_of_images(self.renderer, each, part, self.settings, self.error)
+            information_of_images(self.renderer, each, part, self.settings, self.error, self._pixels)
             for each in ([*before, action.camera], before)
         )
         return both - alone
+
+    def _pixels(self, camera: Camera) -> int:
+        """How many pixels of a camera's images are compared."""
+        compared = self.camera(View(camera))
+        return compared.width * compared.height
 
     # ---- proposals of the nuisance parameters
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -165,11 +165,6 @@ class DrawnErrors:
     def arm_is_right(self) -> bool:
         """Whether encoders state the grip's true pose."""
         return self.arm_is_exact and self.arm_is_stiff
-
-    def with_bent(self, logarithms: Array) -> DrawnErrors:
-        """With compliances of joints and gripper (12,) times the exponentials of numbers (12,)."""
-        factors = np.exp(logarithms)
-        return replace(self, joints=self.joints * factors[:6], gripper=self.gripper * factors[6:])
 
 
 def drawn_errors(
