@@ -41,6 +41,7 @@ from bcppl.inference.progress import watched
 from bcppl.inference.resampling import seeded
 from bcppl.inference.summaries import is_pose, mean
 from bcppl.traces import Trace
+from bcppl.traces.concatenation import concatenated
 
 Run = Callable[[int], Any]
 
@@ -191,16 +192,8 @@ class Repeated:
             InputError: the runs are of a long series, whose traces depend on the steps before.
         """
         _refuse_series(self.populations[0])
-        traces = [population.trace for population in self.populations]
-        first = traces[0]
-        shared = set.intersection(*(set(trace.known) for trace in traces))
-        trace = replace(
-            first,
-            particles=sum(trace.particles for trace in traces),
-            choices={a: torch.cat([trace.choices[a] for trace in traces]) for a in first.choices},
-            known={a: torch.cat([trace.known[a] for trace in traces]) for a in first.known if a in shared},
-            carried={},
-        )
+        # Simulators' states are left: pooled particles are read, and seldom moved.
+        trace = concatenated([replace(p.trace, carried={}) for p in self.populations])
         before = np.cumsum([0, *(int(p.founders.max()) + 1 for p in self.populations)])
         founders = [p.founders + int(b) for p, b in zip(self.populations, before, strict=False)]
         return Population(trace, self.log_weights, self.log_evidence, torch.cat(founders))

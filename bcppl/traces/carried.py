@@ -21,7 +21,7 @@ from torch import Tensor
 
 from bcppl.traces.dependence.equality import Array, alike, equal, snapshot
 from bcppl.traces.differentiation.graph import carries
-from bcppl.traces.indexing import beside
+from bcppl.traces.indexing import broadcast
 
 
 class Carryable(Protocol):
@@ -148,7 +148,7 @@ def _chosen(mask: Tensor, first: Array, second: Array) -> Array | None:
         return first
     if first.shape != second.shape or first.shape[:1] != mask.shape or first.dtype != second.dtype:
         return None
-    mask = beside(mask, first)
+    mask = broadcast(mask, first)
     if isinstance(first, Tensor) and isinstance(second, Tensor):
         return torch.where(mask, first, second)
     return np.where(mask.numpy(), first, second)

@@ -19,7 +19,7 @@ def particles_at(key: Index, particles: int) -> Tensor:
     return torch.arange(particles)[list(key) if isinstance(key, tuple) else key].reshape(-1)
 
 
-def beside(mask: Tensor, values: Tensor | npt.NDArray[Any]) -> Tensor:
+def broadcast(mask: Tensor, values: Tensor | npt.NDArray[Any]) -> Tensor:
     """A mask (N,) with as many axes as values (N, ...)."""
     return mask.reshape(-1, *[1] * (values.ndim - 1))
 

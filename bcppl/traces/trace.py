@@ -20,7 +20,7 @@ from bcppl.traces.dependence.changes import changed
 from bcppl.traces.differentiation.graph import kept
 from bcppl.traces.evaluation import Hiding, log_probability
 from bcppl.traces.explained import hidden_site, other_addresses, refuse_masked
-from bcppl.traces.indexing import Index, aligned, beside, particles_at
+from bcppl.traces.indexing import Index, aligned, broadcast, particles_at
 from bcppl.traces.run import Program, Run, run
 from bcppl.traces.structural import Structure
 from bcppl.traces.values import Value, held, shapes, tensors
@@ -221,7 +221,9 @@ class Trace:
         """This trace where `mask` (N,) is true, the other (same program, same addresses) elsewhere."""
         shared = self.known.keys() & other.known.keys()
         return self._like(
-            choices={a: torch.where(beside(mask, v), v, other.choices[a]) for a, v in self.choices.items()},
+            choices={
+                a: torch.where(broadcast(mask, v), v, other.choices[a]) for a, v in self.choices.items()
+            },
             carried={
                 a: merged
                 for a, e in self.carried.items()

@@ -20,14 +20,14 @@ _MODES, _FAINT = 8, 10.0  # that views leave: at most so many, within so many na
 
 
 @dataclass(frozen=True, eq=False)
-class Fitted:
+class ViewpointFit:
     """The action of a viewpoint's first measurement, and the Gaussian fitted to that."""
 
     action: Any
     fit: Any
 
 
-def by_instrument(scene: Any, fits: Sequence[Fitted]) -> list[list[int]]:
+def by_instrument(scene: Any, fits: Sequence[ViewpointFit]) -> list[list[int]]:
     """The places of each instrument's own among the fits."""
     groups: dict[str, list[int]] = {}
     for k, each in enumerate(fits):
@@ -35,7 +35,7 @@ def by_instrument(scene: Any, fits: Sequence[Fitted]) -> list[list[int]]:
     return list(groups.values())
 
 
-def given_fits(scene: Any, fits: Sequence[Fitted]) -> GaussianMixture:
+def given_fits(scene: Any, fits: Sequence[ViewpointFit]) -> GaussianMixture:
     """The part's pose given the fits, the nuisance parameters integrated out; the prior where there is none.
 
     It has one component for each combination of the instruments' own, as far as they agree.

@@ -34,7 +34,7 @@ from bcppl.distributions.poses import MixturePose
 from bcppl.distributions.support import freedom_of
 from bcppl.errors import InputError
 from bcppl.inference.approximations.adaptive import adapted
-from bcppl.inference.approximations.fits import Fitted, by_instrument, given_fits
+from bcppl.inference.approximations.fits import ViewpointFit, by_instrument, given_fits
 from bcppl.inference.approximations.laplace import (
     Normal,
     QuadraticApproximation,
@@ -60,7 +60,7 @@ class GaussianApproximation:
 
     pose: str  # the address of the part's pose
     scene: Any  # of the model; it has the prior and the sensors' likelihoods
-    fits: Mapping[str, Fitted] = field(default_factory=dict)  # by viewpoint
+    fits: Mapping[str, ViewpointFit] = field(default_factory=dict)  # by viewpoint
     contacts: tuple[Approximated, ...] = ()  # measurements with a quadratic approximation
     quadratic: QuadraticApproximation | None = None  # of the contacts' likelihood; None before the first
     adapted: QuadraticApproximation | None = None  # the same by importance sampling, for proposals
@@ -124,7 +124,7 @@ class GaussianApproximation:
             if name in self.fits:
                 return replace(self, scene=scene)
             near = moved(self.near, HOST)
-            fits = {**self.fits, name: Fitted(action, sensor.fit(number, action, observations, near))}
+            fits = {**self.fits, name: ViewpointFit(action, sensor.fit(number, action, observations, near))}
             # The estimate moves, so it is asked again which contacts are informative there.
             return replace(self, scene=scene, fits=fits, relevant={})
         if isinstance(sensor, Linearised) and sensor.address(number) in observations:

@@ -26,7 +26,7 @@ from bcppl.inference.population import Population
 from bcppl.inference.targets import POSTERIOR
 from bcppl.traces import Trace, simulate, update
 from bcppl.traces.checks.runs import seed as seeded, undisturbed
-from bcppl.traces.indexing import beside
+from bcppl.traces.indexing import broadcast
 from bcppl.traces.run import Program
 
 TAUGHT = 300  # draws that the kernel is fitted to, none of which it moves
@@ -155,7 +155,7 @@ def _nudged(trace: Trace, chosen: Tensor, data: Sequence[str]) -> dict[str, Tens
         else:
             free = biject_to(support).inv(value)
             off = biject_to(support)(free + step * (1.0 + free.abs()))
-        values[address] = torch.where(beside(chosen, value), off, value)
+        values[address] = torch.where(broadcast(chosen, value), off, value)
     return values
 
 

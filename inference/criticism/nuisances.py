@@ -53,7 +53,7 @@ class SuddenChange(NamedTuple):
 
 
 @runtime_checkable
-class SharesErrors(Protocol):
+class InfersSharedErrors(Protocol):
     """A distribution that integrates errors out which several measurements share."""
 
     def shared_moments(self, value: Tensor) -> Mapping[str, tuple[Tensor, Tensor]]:
@@ -88,5 +88,5 @@ def sudden_changes(population: Population) -> list[SuddenChange]:
 def _newest(population: Population) -> list[tuple[Any, Tensor]]:
     """The newest site that shares errors, which is given what earlier ones have observed, and its value."""
     trace = population.trace
-    sites = [a for a in trace.observations if isinstance(trace.distributions[a], SharesErrors)]
+    sites = [a for a in trace.observations if isinstance(trace.distributions[a], InfersSharedErrors)]
     return [(trace.distributions[a], trace[a]) for a in sites[-1:]]

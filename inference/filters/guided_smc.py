@@ -124,7 +124,7 @@ def guided(
     moves: Kernel,
     *,
     sweeps: int | Until = 1,
-    share: float = 0.5,
+    threshold: float = 0.5,
     screen: bool = True,
     search: Callable[[Population, Trace], Searched] | None = None,
 ) -> StepFunction:
@@ -135,14 +135,14 @@ def guided(
         programs: the kernels and proposals that go with it.
         moves: of every particle after each step.
         sweeps: how many of them, or `until(...)`.
-        share: particles are resampled below this effective sample size, as a share of N.
+        threshold: particles are resampled below this effective sample size, as a share of N.
         screen: whether a cheap likelihood of what is simulated chooses among copies of the particles.
         search: given the population after each step and the trace before it, returns that population or
             another that takes its place, and where its particles come from.
     """
 
     def resample(population: Population) -> tuple[Population, Tensor | None]:
-        if population.effective_sample_size >= share * len(population):
+        if population.effective_sample_size >= threshold * len(population):
             return population, None
         ancestors = by_mode(population, len(population))
         return population.selected(ancestors), ancestors
@@ -257,7 +257,7 @@ def infer(
     particles: int = 75,
     seed: int = 0,
     sweeps: int | None = None,
-    share: float = 0.5,
+    threshold: float = 0.5,
     screen: bool = True,
     scene: Any = None,
     start: Step | None = None,
@@ -272,7 +272,7 @@ def infer(
         seed: same seed, same beliefs.
         sweeps: moves of every particle after each measurement; by default until the part's poses have left
             where they were, by `DISPLACED` variances along each axis, and at most `MOST_SWEEPS`.
-        share: particles are resampled below this effective sample size, as a share of N.
+        threshold: particles are resampled below this effective sample size, as a share of N.
         screen: whether a cheap likelihood of what is simulated chooses among copies of the particles and
             decides their moves first (`bcppl.inference.filters.screening`), where the model has one.
         scene: `model.prepare(recording)` unless given.
@@ -286,7 +286,9 @@ def infer(
     particles = whole_number("SMC is to run {} particles", particles)
     if sweeps is not None:
         sweeps = whole_number("SMC is to make {} sweeps", sweeps)
-    share = number_within("particles are to be resampled below a share of {}", share, least=0.0, most=1.0)
+    threshold = number_within(
+        "particles are to be resampled below a share of {}", threshold, least=0.0, most=1.0
+    )
     programs = GaussianPrograms()
 
     def gaussian(scene: Any) -> GaussianApproximation:
@@ -308,7 +310,7 @@ def infer(
         return searched(population, independent_proposal)
 
     times = sweeps or until(displacement=DISPLACED, of=(model.pose,), most=MOST_SWEEPS)
-    step = guided(gaussian, programs, moves, sweeps=times, share=share, screen=screen, search=search)
+    step = guided(gaussian, programs, moves, sweeps=times, threshold=threshold, screen=screen, search=search)
     return smc(
         model, recording, step=step, particles=particles, seed=seed, scene=scene, start=start, device=device
     )

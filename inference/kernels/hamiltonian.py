@@ -20,7 +20,7 @@ from bcppl.inference.summaries import weighted_covariance
 from bcppl.inference.targets import Target
 from bcppl.traces import Trace, update
 from bcppl.traces.differentiation.programs import log_prob_with_grad
-from bcppl.traces.indexing import beside
+from bcppl.traces.indexing import broadcast
 from bcppl.traces.run import inward
 
 
@@ -111,7 +111,7 @@ def hamiltonian_move(
         values, log_jacobian = space.values(position)
         # Where an exponential has overflowed or underflowed, the particle has left the support.
         sound &= torch.isfinite(log_jacobian) & space.inside(values)
-        values = {a: torch.where(beside(sound, v), v, trace[a]) for a, v in values.items()}
+        values = {a: torch.where(broadcast(sound, v), v, trace[a]) for a, v in values.items()}
         log_ratio = 0.5 * (momentum**2 - last**2).sum(dim=1) + log_jacobian - space.values(start)[1]
         log_ratio = torch.where(sound, log_ratio, -torch.inf)
         new = update(trace, values).trace

@@ -14,7 +14,7 @@ from bcppl.inference.population import Population
 from bcppl.inference.proposals.proposal import Proposal, program_of
 from bcppl.inference.targets import Target, visible
 from bcppl.traces import Trace, assess, propose, update
-from bcppl.traces.indexing import beside
+from bcppl.traces.indexing import broadcast
 
 
 def metropolis_hastings(proposal: Proposal, *learned: Callable[[Population], Any]) -> Kernel:
@@ -56,7 +56,7 @@ def metropolis_hastings(proposal: Proposal, *learned: Callable[[Population], Any
             # A value to which its own proposal gives no density has left the range of its type: it stays.
             lost = forward.log_prob == -torch.inf
             if bool(lost.any()):
-                new = {a: torch.where(beside(lost, v), trace[a], v) for a, v in new.items()}
+                new = {a: torch.where(broadcast(lost, v), trace[a], v) for a, v in new.items()}
             updated = update(trace, new)
             refuse_observed("a proposal", forward.choices, updated.trace)
             reverse = {**forward.choices, **updated.discarded}

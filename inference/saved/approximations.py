@@ -12,7 +12,7 @@ from typing import Any
 
 from bcppl.distributions.fitted import FittedMixture
 from bcppl.errors import InputError
-from bcppl.inference.approximations.fits import Fitted
+from bcppl.inference.approximations.fits import ViewpointFit
 from bcppl.inference.approximations.gaussian import GaussianApproximation
 from bcppl.inference.approximations.laplace import QuadraticApproximation
 from bcppl.sensors.capabilities import Approximated, FitsPose
@@ -78,13 +78,13 @@ def approximation_of(content: Content | None, trace: Trace) -> GaussianApproxima
     )
 
 
-def _fitted(name: str, known: Any, scene: Any, actions: Sequence[Any], trace: Trace) -> Fitted:
+def _fitted(name: str, known: Any, scene: Any, actions: Sequence[Any], trace: Trace) -> ViewpointFit:
     for number, action in enumerate(actions):
         sensor = scene.sensor(action)
         if isinstance(sensor, FitsPose) and sensor.viewpoint(action) == name:
             again = known is None
             fit = sensor.fit(number, action, trace.observations) if again else FittedMixture(*known)
-            return Fitted(action, fit)
+            return ViewpointFit(action, fit)
     raise LookupError(f"no measurement by {name!r}")
 
 

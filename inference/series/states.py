@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from bcppl.traces.carried import Entry
-from bcppl.traces.indexing import beside
+from bcppl.traces.indexing import broadcast
 
 
 def merged(mask: Tensor, first: Any, second: Any) -> Any:
@@ -19,7 +19,7 @@ def merged(mask: Tensor, first: Any, second: Any) -> Any:
     else than tensors and their containers is merged by its own `where(mask, other)`.
     """
     if isinstance(first, Tensor):
-        return first if first.ndim == 0 else torch.where(beside(mask, first), first, second)
+        return first if first.ndim == 0 else torch.where(broadcast(mask, first), first, second)
     if isinstance(first, Mapping):
         return {key: merged(mask, value, second[key]) for key, value in first.items()}
     if isinstance(first, list | tuple):

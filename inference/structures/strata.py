@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, NoReturn
@@ -16,8 +16,7 @@ from bcppl.errors import InputError, OtherKindError
 from bcppl.inference.population import FIELDS, Population
 from bcppl.inference.summaries import Probabilities
 from bcppl.traces import Structure, Trace
-from bcppl.traces.series import SeriesTrace
-from bcppl.traces.values import shapes
+from bcppl.traces.concatenation import concatenated
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -226,49 +225,12 @@ def joined(populations: Iterable[Population]) -> Population:
     halved = all(len(each.sides) for each in populations)
     return replace(
         first,
-        trace=_joined([each.trace for each in populations]),
+        trace=concatenated([each.trace for each in populations]),
         log_weights=torch.cat([each.log_weights for each in populations]),
         founders=torch.cat([each.founders for each in populations]),
         # Numbers of families that are equal by chance make groups larger than they have to be.
         families=torch.cat([each.families[:, :1] for each in populations]) if halved else first.families[:0],
         sides=torch.cat([each.sides for each in populations]) if halved else first.sides[:0],
-    )
-
-
-def _joined(traces: Sequence[Trace]) -> Trace:
-    first, *others = traces
-    if isinstance(first, SeriesTrace):
-        raise InputError(
-            "particles of a series from several structures cannot be joined, as their pasts differ; write "
-            "the program with a loop over the steps."
-        )
-    for other in others:
-        if set(first.choices) != set(other.choices):
-            raise InputError(
-                f"two traces of {first.structure} have other latent addresses ({shapes(first.choices)}, and "
-                f"{shapes(other.choices)}); let a structural site determine which are visited."
-            )
-    carried = dict(first.carried)
-    count = len(first)
-    for other in others:
-        rows = torch.arange(count + len(other))
-        mine, theirs = rows.clamp_max(count - 1), (rows - count).clamp_min(0)
-        # A simulator's state that cannot be joined with the others' is made again when it is asked for.
-        carried = {
-            name: both
-            for name, entry in carried.items()
-            if name in other.carried
-            and (both := entry.take(mine).where(rows < count, other.carried[name].take(theirs))) is not None
-        }
-        count += len(other)
-    known = set(first.known).intersection(*(each.known for each in others))
-    return replace(
-        first,
-        particles=count,
-        choices={a: torch.cat([each.choices[a] for each in traces]) for a in first.choices},
-        carried=carried,
-        known={a: torch.cat([each.known[a] for each in traces]) for a in first.known if a in known},
-        hidden=first.hidden.union(*(each.hidden for each in others)),
     )
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from bcppl.errors import InputError
 from bcppl.traces.checks.comparing import TOLERANCE, differing, log_probs, rerun
 from bcppl.traces.faults import Fault, ProgramError
-from bcppl.traces.indexing import indexed
+from bcppl.traces.indexing import broadcast, indexed
 from bcppl.traces.series import SeriesTrace
 from bcppl.traces.trace import Trace
 
@@ -36,7 +36,7 @@ def check_particles(trace: Trace, other: Trace) -> None:
     own, others = signature(trace), signature(other)
     for mask in _masks(count):
         mixed = signature(rerun(trace.where(mask, other)))
-        expected = {a: torch.where(_beside(mask, v), v, others[a]) for a, v in own.items()}
+        expected = {a: torch.where(broadcast(mask, v), v, others[a]) for a, v in own.items()}
         if (site := _unlike(expected, mixed)) is not None:
             raise _mixing(trace, other, site)
     for order in (torch.arange(count).flip(0), torch.arange(count).roll(1)):
@@ -99,10 +99,6 @@ def _masks(count: int) -> list[Tensor]:
     """Which particles stay: every second one, all but the first, the first alone."""
     places = torch.arange(count)
     return [places % 2 == 0, places > 0, places == 0]
-
-
-def _beside(mask: Tensor, value: Tensor) -> Tensor:
-    return mask.reshape(-1, *[1] * (value.ndim - 1))
 
 
 def _unlike(expected: dict[str, Tensor], got: dict[str, Tensor]) -> str | None:
