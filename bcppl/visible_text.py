@@ -1,6 +1,11 @@
-"""Text that came from a file, as a terminal may show it."""
+"""Text that came from a file, as a terminal or a figure may show it."""
 
 from __future__ import annotations
+
+
+def in_figure(text: str) -> str:
+    """The text as matplotlib shows it, which would read formulas between two dollar signs."""
+    return visible(text).replace("$", r"\$")
 
 
 def visible(text: str) -> str:

@@ -9,21 +9,25 @@ import json
 import re
 import tempfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from bcppl import poses
 from bcppl.beliefs import Belief
 from bcppl.cli.commands import probe
+from bcppl.geometry.holes import hole_of
 from bcppl.inference.filters.guided_smc import infer
 from bcppl.inference.planning.candidate_layout import MIXED
+from bcppl.models import load_recording
 from bcppl.models.look_and_touch import model
 from bcppl.models.worlds.bench.scene import bench_scene
 from bcppl.recordings import save
 from bcppl.recordings.action_file import load_actions, save_actions
-from bcppl.recordings.beliefs import load_belief, load_latent, save_belief
+from bcppl.recordings.beliefs import load_belief, load_fingerprint, load_latent, save_belief
 from bcppl.recordings.fingerprint import fingerprint
 from bcppl.robot.plan import Plan
 from tests.command_line import SHIPPED, Ran, short
@@ -260,7 +264,7 @@ def test_an_insertion_is_planned_from_a_belief_within_limits(bcppl: Callable[...
     box = "0 0 0 0.001 0.001 0.001"
     refused(bcppl("insert", "runs/belief_002.h5", "--workspace", box), "outside --workspace")
     refused(bcppl("insert", "runs/belief_002.h5", "--workspace", "1 2"), "give six numbers")
-    refused(bcppl("insert", "runs/belief_002.h5", "-o", "plan.txt"), "ending in .h5 or .json")
+    refused(bcppl("insert", "runs/belief_002.h5", "-o", "plan.txt"), "ends in .h5 or .json")
     save(short(1), here / "push.h5")
     refused(bcppl("insert", "push.h5", "--particles", 6), "no peg to insert")
 
@@ -272,3 +276,27 @@ def test_a_recording_is_played_and_its_belief_kept(bcppl: Callable[..., Ran], he
     assert "2 of 2 updates were done within 60 s" in ran.out and "push 2" in ran.out
     assert len(load_belief(here / "last.h5")) == 6
     refused(bcppl("live", "pushes.h5", "-o", "nowhere/last.h5"), "no folder nowhere")
+    for command in (("live", "-o"), ("view", "--save"), ("insert", "-o")):
+        refused(bcppl(command[0], "pushes.h5", command[1], "pushes.h5"), "would overwrite pushes.h5")
+
+
+def test_what_is_planned_is_planned_of_the_belief_that_was_kept(
+    bcppl: Callable[..., Ran], here: Path
+) -> None:
+    """A file that lacks the values of a camera's errors would have them, and the pose, from the prior."""
+    whole = load_recording("peg_probe")
+    save(replace(whole, measurements=whole.measurements[:1]), here / "seen.h5")
+    assert bcppl("live", "seen.h5", "--particles", 8, "--speed", 1000, "-o", "last.h5").code == 0
+    words = ("--of", "seen.h5", "--simulations", 0, "--json")
+    ran = bcppl("insert", "last.h5", *words)
+    assert ran.code == 0, ran.err
+    belief = load_belief(here / "last.h5")
+    hole = poses.compose(belief.mean, torch.from_numpy(hole_of(whole.part).part_from_hole))
+    np.testing.assert_allclose(json.loads(ran.out)["world_from_hole"][:3], hole[:3], atol=1e-6)
+    kept = {"label": "view 1", "of": load_fingerprint(here / "last.h5")}
+    kept |= {"log_evidence": 0.0, "random_state": torch.get_rng_state()}
+    save_belief(belief, here / "poses.h5", **kept)
+    refused(bcppl("insert", "poses.h5", *words), "holds no values of bias_camera")
+    other = {**load_latent(here / "last.h5"), "part": belief.world_from_part.flip(0)}
+    save_belief(belief, here / "other.h5", latent=other, **kept)
+    refused(bcppl("insert", "other.h5", *words), "has other poses at 'part'")

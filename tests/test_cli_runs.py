@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -14,6 +15,7 @@ import torch
 
 from bcppl.beliefs import Belief
 from bcppl.cli.commands.run import next_label
+from bcppl.cli.run_folder import RunFolder, beside
 from bcppl.errors import InputError
 from bcppl.recordings import save
 from bcppl.recordings.beliefs import load_belief, load_latent
@@ -95,14 +97,50 @@ def test_what_was_computed_before_a_stop_is_kept(
     assert "push 2" in ran.out and "standard deviation" in ran.out
 
 
-def test_an_earlier_runs_beliefs_do_not_lie_among_the_new(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
+def test_what_a_folder_holds_of_others_is_left_as_it_is(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
     save(short(1), tmp_path / "short.h5")
     (tmp_path / "out").mkdir()
-    for name in ("belief_007.h5", "old.png", "notes.txt"):
+    others = ("view_0.png", "belief_of_mine.h5", "notes.txt")
+    for name in (*others, "belief_007.h5"):
         (tmp_path / "out" / name).write_text("old")
-    assert bcppl("run", "short.h5", "--particles", 4, "--out", "out").code == 0
-    found = {p.name for p in (tmp_path / "out").iterdir()}
-    assert "notes.txt" in found and "belief_007.h5" not in found
+    words = ("run", "short.h5", "--particles", 4, "--inference", FEW_MOVES, "--out", "out")
+    ran = bcppl(*words)
+    assert ran.code == 2 and "out has a file belief_007.h5 and no run.json" in ran.err
+    (tmp_path / "out/belief_007.h5").unlink()
+    assert bcppl(*words).code == 0
+    assert all((tmp_path / "out" / name).read_text() == "old" for name in others)
+
+
+def test_of_two_runs_that_begin_at_once_in_one_folder_one_is_refused(tmp_path: Path) -> None:
+    recording, settings = short(1), {"particles": 4}
+    RunFolder(tmp_path / "out", recording, settings)  # has made no step so far
+    with pytest.raises(InputError, match="holds a run already"):
+        RunFolder(tmp_path / "out", recording, settings)
+    taken = [beside(tmp_path / "runs/log").name for _ in range(3)]
+    assert taken == ["log", "log_2", "log_3"]
+
+
+def test_a_run_that_makes_no_step_leaves_no_folder(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
+    save(short(1), tmp_path / "short.h5")
+    (tmp_path / "fails.py").write_text(
+        "from bcppl.errors import InferenceError\n"
+        "def infer(model, recording, **options):\n    raise InferenceError('nothing to be done.')\n"
+    )
+    ran = bcppl("run", "short.h5", "--inference", "fails.py")
+    assert ran.code == 1 and "nothing to be done." in ran.err
+    assert not (tmp_path / "runs/short").exists()
+
+
+def test_names_with_dollars_and_escapes_are_drawn_and_printed(
+    bcppl: Callable[..., Ran], tmp_path: Path
+) -> None:
+    recording = short(1)
+    part = replace(recording.part, name="tray $5 {a and $6 \x1b]0;owned\x07")
+    save(replace(recording, part=part), tmp_path / "dollar.h5")
+    ran = bcppl("run", "dollar.h5", "--particles", 4, "--inference", FEW_MOVES, "--out", "o/[red]y")
+    assert ran.code == 0, ran.err
+    assert "o/[red]y" in ran.out and "\x1b]" not in ran.out
+    assert (tmp_path / "o/[red]y/report.html").exists()
 
 
 MANY = """

@@ -45,7 +45,7 @@ def test_a_run_is_the_same_as_of_the_command_run(bcppl: Callable[..., Ran], tmp_
     assert swept.world_from_part.equal(alone.world_from_part) and swept.log_weights.equal(alone.log_weights)
 
 
-def test_a_changed_file_is_another_cell_and_a_failure_is_one_result(
+def test_a_changed_file_is_another_cell_and_a_failure_is_tried_again(
     bcppl: Callable[..., Ran], tmp_path: Path
 ) -> None:
     save(short(1), tmp_path / "log.h5")
@@ -57,10 +57,30 @@ def test_a_changed_file_is_another_cell_and_a_failure_is_one_result(
     (tmp_path / "mine.py").write_text(mine + "\ninfer = broken\n")
     words = ("--inference", "mine.py", *WORDS[2:])
     ran = bcppl("sweep", "log.h5", *words)
-    assert ran.code == 1 and "1 of 1 runs failed, the first so: no particle is left." in ran.err
+    assert ran.code == 1 and "1 of 1 cells failed" in ran.err and "no particle is left" in ran.err
     (tmp_path / "mine.py").write_text(mine)
     assert bcppl("sweep", "log.h5", *words).code == 0
-    assert len((tmp_path / "found/results.jsonl").read_text().splitlines()) == 2
+    assert len((tmp_path / "found/results.jsonl").read_text().splitlines()) == 1
+
+
+def test_a_setting_that_is_a_file_is_read_again_where_it_has_changed(
+    bcppl: Callable[..., Ran], tmp_path: Path
+) -> None:
+    save(short(1), tmp_path / "log.h5")
+    (tmp_path / "mine.py").write_text(
+        "from dataclasses import replace\nfrom pathlib import Path\n"
+        "from bcppl.models.point_probe import model as own\n"
+        "def prepare(recording, spread):\n"
+        "    return own.prepare(recording, spread=float(Path(spread).read_text()))\n"
+        "model = replace(own, prepare=prepare)\n"
+    )
+    words = ("--model", "mine.py", "--set", "spread=spread.txt", *WORDS)
+    for spread in ("0.0004", "0.004", "0.004"):
+        (tmp_path / "spread.txt").write_text(spread)
+        ran = bcppl("sweep", "log.h5", *words)
+        assert ran.code == 0, ran.err
+    kept = [json.loads(line)[1] for line in (tmp_path / "found/results.jsonl").read_text().splitlines()]
+    assert len(kept) == 2 and kept[0]["log_evidence"] != kept[1]["log_evidence"]
 
 
 def test_what_cannot_be_swept_is_refused_in_a_sentence(bcppl: Callable[..., Ran], tmp_path: Path) -> None:

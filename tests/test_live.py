@@ -22,7 +22,7 @@ from bcppl.inference.live import Filter, Sampler, play
 from bcppl.models import load_recording
 from bcppl.models.look_and_touch import model
 from bcppl.robot.motion import Probe
-from bcppl.sensors import Measurement, ProbeWindow, Recording, Touch
+from bcppl.sensors import Measurement, ProbeWindow, Recording, Touch, View
 
 FEW = 20
 
@@ -139,6 +139,19 @@ def test_an_error_of_a_callback_ends_the_filter_and_is_seen(touched: Recording) 
         pass
     with pytest.raises(InputError, match="the live filter is closed"):
         live.observe(first.action, first.observation)
+
+
+def test_a_camera_of_the_name_of_another_is_refused(touched: Recording) -> None:
+    views = [m for m in load_recording("peg_probe").measurements if isinstance(m.action, View)]
+    namesake = View(replace(views[1].action.camera, name=views[0].action.camera.name))
+    nameless = View(replace(views[1].action.camera, name=""))
+    with Filter(model, replace(touched, measurements=[]), particles=FEW) as live:
+        live.observe(views[0].action, views[0].observation)
+        with pytest.raises(InputError, match="of cameras differs from an earlier one"):
+            live.observe(namesake, views[1].observation)
+        with pytest.raises(InputError, match="empty name"):
+            live.observe(nameless, views[1].observation)
+        assert live.settle().taken == 1
 
 
 def joined_touch(recording: Recording) -> Touch:

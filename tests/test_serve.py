@@ -75,7 +75,7 @@ def test_clients_that_stall_or_send_garbage_or_know_no_token_hold_up_nobody(
         garbage.sendall(struct.pack(">I", 5) + b"\xc1\xc1\xc1\xc1\xc1")
         stranger.sendall(wire.packed({"token": "guessed"}) + wire.packed({"ask": "belief"}))
         huge = socket.create_connection(served.address)
-        huge.sendall(struct.pack(">I", 2**31))
+        huge.sendall(struct.pack(">I", 2**20))  # before its token is known
         with Client(*served.address, "secret") as client:
             for number in range(20):
                 assert client.ask(str(number)) == {"asked": str(number)}
@@ -107,6 +107,8 @@ def test_arrays_come_back_and_lists_within_lists_do_not_exhaust_the_stack() -> N
         wire.unpacked(b"\x81\xa1a" + b"\x91" * 100_000 + b"\x00")
     with pytest.raises(InputError, match="nested"):
         wire.unpacked(b"\x81\xa1a" + b"\x91" * 10 + b"\x00")
+    with pytest.raises(InputError, match="more than 4096 maps and lists"):
+        wire.unpacked(msgpack.packb({"a": [{}] * 100_000}))
     with pytest.raises(InputError, match="does not fit its bytes"):
         wire.unpacked(msgpack.packb({"a": {"shape": [2**20, 2**20], "float64": b""}}))
 
@@ -172,6 +174,19 @@ def test_what_is_wrong_is_answered_in_a_sentence(
     session: Session, request_: dict[str, Any], sentence: str
 ) -> None:
     assert sentence in session.answer(request_)["error"]
+
+
+def test_a_probe_that_is_not_over_keeps_its_samples_and_its_name(session: Session) -> None:
+    probe = {"ask": "begin", "name": "first", "begin": 0.0, "rate": 100.0, "seconds": 1.0}
+    assert session.answer(probe) == {"stamps": 100}
+    for name in ("first", "second"):
+        assert "'first' is not over; ask for 'end'" in session.answer({**probe, "name": name})["error"]
+    wrong = {"ask": "samples", "wrench": [[0.0] * 7, [np.nan] * 7], "pose": [[0.0] * 8]}
+    assert "pose" in session.answer({**wrong, "wrench": [[0.0] * 7]})["error"]
+    assert "not finite" in session.answer({**wrong, "pose": []})["error"]
+    assert session._sampler is not None and not session._sampler._streams["wrench"].times
+    assert session.answer({"ask": "end"})["windows"] == 0
+    assert "there was a probe called 'first'" in session.answer(probe)["error"]
 
 
 json_like = st.recursive(

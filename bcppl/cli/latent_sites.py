@@ -16,6 +16,7 @@ from bcppl import poses
 from bcppl.distributions.support import freedom_of, support_of
 from bcppl.inference.population import Population
 from bcppl.inference.summaries import mean, probabilities, quantiles
+from bcppl.visible_text import visible
 
 LIKELIEST = 5  # of a discrete site's values
 ROWS = 12  # of one site's numbers; run.json holds them all
@@ -80,7 +81,7 @@ def table(summaries: Mapping[str, Mapping[str, Any]], pose: str) -> Table:
         shown.add_column(name, justify="left")
     for address, summary in summaries.items():
         for row in _rows(address, summary) if address != pose else ():
-            shown.add_row(*map(escape, row))
+            shown.add_row(*(escape(visible(cell)) for cell in row))
     return shown
 
 

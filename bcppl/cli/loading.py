@@ -63,7 +63,7 @@ def settings(given: Sequence[str]) -> dict[str, Any]:
             raise InputError(f"--set is given {each!r}; give a setting's name and value, --set profile=ur5e.")
         try:
             read[name] = json.loads(value)
-        except ValueError:
+        except (ValueError, RecursionError):
             read[name] = value
     return read
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import torch
 from rich.console import Console
 
 from bcppl import strict_json
@@ -82,7 +83,7 @@ def _read(
     check: Callable[[Recording], None],
 ) -> Posterior:
     """The population of a belief's file, its sites observed as the recording has them."""
-    label, belief, latent = load_label(path), load_belief(path), load_latent(path)
+    label, belief = load_label(path), load_belief(path)
     record = run_record(path)
     of = of or record.get("recording")
     if of is None:
@@ -107,6 +108,11 @@ def _read(
     measured = list(whole.measurements[:assimilated])
     scene = chosen.prepare(whole)
     observed = chosen.observe(scene, measured)
+    latent = {chosen.pose: belief.world_from_part, **load_latent(path)}
+    if not torch.equal(latent[chosen.pose], belief.world_from_part):
+        raise InputError(
+            f"{path} has other poses at {chosen.pose!r} than it states as its belief; make it again."
+        )
     try:
         trace, _ = generate(
             chosen.program, (scene, [m.action for m in measured]), observed, len(belief), choices=latent
@@ -115,6 +121,12 @@ def _read(
         raise InputError(
             f"{path} does not fit the model or the recording ({error}); give --of and --model as it was run."
         ) from error
+    # What a file lacks was drawn from the prior.
+    if drawn := [address for address in trace.choices if address not in latent]:
+        raise InputError(
+            f"{path} holds no values of {', '.join(drawn)}, which the model infers besides the pose; give "
+            "one that `bcppl run` or `bcppl live` wrote."
+        )
     check(whole)
     recording = replace(whole, measurements=measured)
     return Posterior(recording, chosen, Population(trace, belief.log_weights), scene)

@@ -96,7 +96,7 @@ class Report:
         return row
 
     def _print_row(self, row: Mapping[str, str], style: str | None = None) -> None:
-        first, *others = (row.get(name, "").rjust(width) for name, width in WIDTHS.items())
+        first, *others = (visible(row.get(name, "")).rjust(width) for name, width in WIDTHS.items())
         line = " ".join([first.strip().ljust(WIDTHS["measurement"]), *others])
         self.console.print(line, style=style, soft_wrap=True, markup=False)
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
+from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,6 +29,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 RECORD, STEP, PAGE = "run.json", "step.h5", "report.html"
+OVER_TIME, IN_SPACE = "add_over_time.png", "belief_in_3d.png"
+_NUMBERED = re.compile(r"belief_\d{3,}\.h5")
 
 
 class RunFolder:
@@ -36,6 +40,7 @@ class RunFolder:
         path: of the folder, which is made.
         recording: that is run.
         settings: of the run, for run.json.
+        begun: whether the folder has a run.json of this run already, and no step to go on from.
 
     Attributes:
         record: the content of run.json.
@@ -43,15 +48,12 @@ class RunFolder:
         history: by step so far, its label and belief.
 
     Raises:
-        InputError: the folder holds a run, or cannot be made.
+        InputError: the folder holds a run, or what a run would write over, or cannot be made.
     """
 
-    def __init__(self, path: Path, recording: Recording, settings: Mapping[str, Any]) -> None:
-        if (path / RECORD).exists() and (path / belief_name(0)).exists():
-            raise InputError(
-                f"{path} holds a run already; give another folder by --out, or go on with that run by "
-                f"`bcppl run --resume {path}`."
-            )
+    def __init__(
+        self, path: Path, recording: Recording, settings: Mapping[str, Any], begun: bool = False
+    ) -> None:
         blocked = next((p for p in (path, *path.parents) if p.exists() and not p.is_dir()), None)
         if blocked is not None:
             raise InputError(f"the folder {path} cannot be made, {blocked} is a file; give another by --out.")
@@ -64,8 +66,11 @@ class RunFolder:
             path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise InputError(f"{path} cannot be made ({error.strerror}); give another --out.") from error
-        for old in (*path.glob("belief_*.h5"), *path.glob("*.png"), path / STEP, path / PAGE):
-            old.unlink(missing_ok=True)
+        if begun:
+            for old in _written(path):
+                old.unlink()
+        else:
+            _claim(path)
         self.note(complete=False, rows=[], checked={})
 
     @classmethod
@@ -111,6 +116,12 @@ class RunFolder:
         """The content of run.json as text."""
         return json.dumps(self.record, indent=1)
 
+    def discard(self) -> None:
+        """Leave no trace of a run that has made no step."""
+        with suppress(OSError):
+            (self.path / RECORD).unlink()
+            self.path.rmdir()
+
     def draw(self) -> None:
         """Draw ADD over the measurements, from the final mean where the truth is unknown, and beliefs."""
         from bcppl.figures import add_over_time, belief_in_3d  # matplotlib takes longer than a first step
@@ -126,7 +137,7 @@ class RunFolder:
         figure = add_over_time(np.arange(len(labels), dtype=np.float64), adds, weights, labels, contact)
         if not known:
             figure.axes[0].set_ylabel("distance from the final mean (mm)")
-        self._keep(figure, "add_over_time.png")
+        self._keep(figure, OVER_TIME)
         looked = [k for k, touches in enumerate(touching, 1) if not touches]
         shown = [
             (
@@ -136,7 +147,7 @@ class RunFolder:
             )
             for k in dict.fromkeys([0, looked[-1] if looked else len(labels) // 2, len(labels) - 1])
         ]
-        self._keep(belief_in_3d(recording.part, shown, recording.truth), "belief_in_3d.png")
+        self._keep(belief_in_3d(recording.part, shown, recording.truth), IN_SPACE)
 
     def write_page(self, conclusion: str, last: Any) -> None:
         """Write report.html, given the result in words and the last step."""
@@ -156,13 +167,49 @@ def belief_name(number: int) -> str:
     return f"belief_{number:03d}.h5"
 
 
+def _written(path: Path) -> list[Path]:
+    """The files in a folder that have names of those that a run writes, but for run.json."""
+    beliefs = [file for file in path.glob("belief_*.h5") if _NUMBERED.fullmatch(file.name)]
+    others = [path / name for name in (STEP, PAGE, OVER_TIME, IN_SPACE)]
+    return [*sorted(beliefs), *(file for file in others if file.exists())]
+
+
+def _claim(path: Path) -> None:
+    """Make run.json, which no other run has made: of two that begin at once, one is refused."""
+    held = f"{path} holds a run already; give another folder by --out, or go on with that run by"
+    if not (path / RECORD).exists() and (others := _written(path)):
+        raise InputError(
+            f"{path} has a file {others[0].name} and no {RECORD}: a run would write over it; give another "
+            "folder by --out."
+        )
+    try:
+        (path / RECORD).open("x").close()
+    except FileExistsError:
+        raise InputError(f"{held} `bcppl run --resume {path}`.") from None
+    except OSError as error:
+        raise InputError(f"{path} cannot be written into ({error.strerror}); give another --out.") from error
+
+
 def beside(path: Path) -> Path:
-    """The folder, or where it is taken the next one: `runs/name`, `runs/name_2`, `runs/name_3`."""
+    """The folder, made; where it is taken the next one: `runs/name`, `runs/name_2`, `runs/name_3`."""
     number, free = 1, path
-    while free.exists():
-        number += 1
-        free = path.with_name(f"{path.name}_{number}")
-    return free
+    while True:
+        try:
+            free.mkdir(parents=True)
+        except FileExistsError:
+            number += 1
+            free = path.with_name(f"{path.name}_{number}")
+        except OSError:
+            return free  # which `RunFolder` refuses
+        else:
+            return free
+
+
+_OF_LISTS: Mapping[str, type] = {"rows": dict, "doubts": str, "warnings": str}
+
+
+def _all_are(kind: type, values: Any) -> bool:
+    return values is None or (isinstance(values, list) and all(isinstance(each, kind) for each in values))
 
 
 def read_record(path: Path) -> dict[str, Any]:
@@ -180,6 +227,7 @@ def read_record(path: Path) -> dict[str, Any]:
         record.setdefault("device", "cpu")  # of versions that had no other
     wrong = [] if isinstance(record, dict) else ["recording"]
     wrong = wrong or [name for name, kind in kinds.items() if not isinstance(record.get(name), kind)]
+    wrong = wrong or [name for name, kind in _OF_LISTS.items() if not _all_are(kind, record.get(name))]
     if wrong:
         raise InputError(
             f"{path / RECORD} has no {wrong[0]} as `bcppl run` writes it; run the recording again."

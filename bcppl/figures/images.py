@@ -19,6 +19,7 @@ from bcppl.geometry.parts import Part
 from bcppl.rendering.part_renderer import PartRenderer
 from bcppl.rendering.rasterisation import renderer_for
 from bcppl.sensors import DepthImage, View
+from bcppl.visible_text import in_figure
 
 LARGEST = 10.0  # mm of a residual that the colours tell apart
 
@@ -79,7 +80,7 @@ def depth_residual(axes: Axes, view: View, image: DepthImage, part: Part | PartR
 
 
 def _titled(axes: Axes, view: View, more: str) -> Axes:
-    axes.set_title(", ".join(filter(None, [view.camera.name, more])), fontsize=9)
+    axes.set_title(", ".join(filter(None, [in_figure(view.camera.name), more])), fontsize=9)
     axes.set_xlabel("column (pixel)", fontsize=8)
     axes.set_ylabel("row (pixel)", fontsize=8)
     axes.tick_params(labelsize=7)

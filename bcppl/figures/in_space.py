@@ -24,6 +24,7 @@ from bcppl.figures.space_elements import (
 from bcppl.geometry.parts import Part
 from bcppl.sensors.candidates import Candidate
 from bcppl.sensors.protocol import FAINT, Drawable, sensor_of
+from bcppl.visible_text import in_figure
 
 HEAVIEST = 10
 
@@ -65,12 +66,12 @@ def belief_in_3d(
         if true is not None:
             arrows(axes, true[None], 1.15 * length, TRUTH, width=4.5, alpha=1.0, zorder=4)
         frame(axes, low, high)
-        axes.set_title(f"{title}\n{in_words(poses, weights, mean, true)}", fontsize=10)
+        axes.set_title(f"{in_figure(title)}\n{in_words(poses, weights, mean, true)}", fontsize=10)
     heaviest = f"{HEAVIEST} heaviest (arrow: z axis, tick: x axis)"
     entries = {
         heaviest: Line2D([], [], color=STRONG, linewidth=1.6),
         "other particles": Line2D([], [], color=PARTICLE, linewidth=1.0),
-        f"{part.name} at the mean": Patch(facecolor=BODY, edgecolor="0.3", alpha=0.6),
+        f"{in_figure(part.name)} at the mean": Patch(facecolor=BODY, edgecolor="0.3", alpha=0.6),
     }
     if true is not None:
         entries["truth"] = Line2D([], [], color=TRUTH, linewidth=4.5)
@@ -121,7 +122,7 @@ def action_in_3d(
         entries["other candidates"] = Line2D([], [], **FAINT)
     shown = np.concatenate([limits_of(part, length, poses, mean), reached])
     frame(axes, shown.min(axis=0), shown.max(axis=0))
-    lines = [title, in_words(poses, weights, mean, None), drawer.caption]
+    lines = [in_figure(title), in_words(poses, weights, mean, None), drawer.caption]
     axes.set_title("\n".join(filter(None, lines)), fontsize=10)
     figure.legend(entries.values(), entries.keys(), loc="lower center", ncols=4, frameon=False, fontsize=9)
     figure.subplots_adjust(left=0.02, right=0.95, top=0.87, bottom=0.14)

@@ -10,7 +10,7 @@ from contextlib import suppress
 
 from bcppl.errors import InputError
 from bcppl.inference.live.session import Session
-from bcppl.inference.live.wire import LENGTH, length_of, packed, unpacked
+from bcppl.inference.live.wire import GREETING, LARGEST, LENGTH, length_of, packed, unpacked
 
 STALLED = 10.0  # s in which a message that has begun has to be complete, and the first one to come
 CLIENTS = 64  # at a time
@@ -62,8 +62,8 @@ class Server:
         except InputError as error:
             with suppress(OSError):
                 writer.write(packed({"error": str(error)}))
-        except (OSError, asyncio.IncompleteReadError, TimeoutError):
-            pass  # it has gone, or has stalled
+        except (OSError, asyncio.IncompleteReadError, TimeoutError, asyncio.CancelledError):
+            pass  # it has gone or has stalled, or the server ends: asyncio would print a cancelled handler
         finally:
             self._clients -= 1
             writer.close()
@@ -73,22 +73,24 @@ class Server:
     async def _converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         if self._clients > CLIENTS:
             raise InputError(f"there are {CLIENTS} clients already; close one.")
-        hello = await asyncio.wait_for(_message(reader), STALLED)
+        hello = unpacked(await asyncio.wait_for(_body(reader, most=GREETING), STALLED))
         given = hello.get("token")
         if not isinstance(given, str) or not hmac.compare_digest(given.encode(), self.token.encode()):
             raise InputError("the token is wrong; send {'token': ...} first, as the server printed it.")
         await _send(writer, {"ok": True})
         while (header := await reader.read(1)) != b"":
-            request = await asyncio.wait_for(_message(reader, header), STALLED)
-            answering = asyncio.get_running_loop().run_in_executor(
-                self._threads, self.session.answer, request
-            )
+            request = await asyncio.wait_for(_body(reader, header), STALLED)
+            answering = asyncio.get_running_loop().run_in_executor(self._threads, self._answer, request)
             await _send(writer, await answering)
 
+    def _answer(self, request: bytes) -> dict[str, object]:
+        """The answer to a message, which is read in a thread, so that no other client waits for it."""
+        return self.session.answer(unpacked(request))
 
-async def _message(reader: asyncio.StreamReader, begun: bytes = b"") -> dict[str, object]:
+
+async def _body(reader: asyncio.StreamReader, begun: bytes = b"", most: int = LARGEST) -> bytes:
     header = begun + await reader.readexactly(LENGTH.size - len(begun))
-    return unpacked(await reader.readexactly(length_of(header)))
+    return await reader.readexactly(length_of(header, most))
 
 
 async def _send(writer: asyncio.StreamWriter, message: dict[str, object]) -> None:

@@ -9,7 +9,8 @@
     {"ask": "next_probe"}              {"plan": {...}, "gain": nats}
     {"ask": "insertion"}               {"search": {...}, "push": {...}}
 
-An answer has "error", one sentence, where something is wrong; the belief is then as it was.
+An answer has "error", one sentence, where something is wrong; of samples, what was complete before the
+fault is assimilated.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from bcppl import poses
 from bcppl.arguments import number_within
 from bcppl.arrays import Array
 from bcppl.errors import InferenceError, InputError
@@ -44,6 +46,8 @@ class Session:
     def __init__(self, live: Filter) -> None:
         self.live = live
         self._sampler: Sampler | None = None
+        probes = (getattr(m.action, "probe", None) for m in live.recording.measurements)
+        self._names = {probe.name for probe in probes if probe is not None}
         self._lock = threading.Lock()  # of the sampler: who ranks or plans holds up nobody's samples
         self._asked: Mapping[str, Callable[[Mapping[str, Any]], Answer]] = {
             "begin": self._begin,
@@ -76,17 +80,19 @@ class Session:
             probe = _unknown(request)
         if len(probe.stamps) > MOST_STAMPS:
             raise InputError(f"the probe has {len(probe.stamps)} stamps; give {MOST_STAMPS} at most.")
-        names = {
-            getattr(getattr(m.action, "probe", None), "name", None) for m in self.live.recording.measurements
-        }
-        if probe.name in names:
-            raise InputError(f"there was a probe called {probe.name[:40]!r}; give each its own name.")
         with self._lock:
+            if self._sampler is not None:
+                under_way = self._sampler.probe.name[:40]
+                raise InputError(f"the probe {under_way!r} is not over; ask for 'end' before another begins.")
+            if probe.name in self._names:
+                raise InputError(f"there was a probe called {probe.name[:40]!r}; give each its own name.")
             self._sampler = Sampler(probe)
+            self._names.add(probe.name)
         return {"stamps": len(probe.stamps)}
 
     def _samples(self, request: Mapping[str, Any]) -> Answer:
         rows = {name: _rows(request, name, width) for name, width in (("wrench", 7), ("pose", 8))}
+        poses.as_pose(rows["pose"][:, 1:], "a sample's pose")
         count = 0
         with self._lock:
             sampler = self._begun()
@@ -182,4 +188,6 @@ def _rows(request: Mapping[str, Any], name: str, width: int) -> Array:
         rows = np.asarray(given, dtype=np.float64).reshape(-1, width) if len(given) else np.empty((0, width))
     except (TypeError, ValueError) as error:
         raise InputError(f"{name} is no list of rows of {width} numbers, the first the stamp.") from error
+    if not np.isfinite(rows).all():
+        raise InputError(f"{name} has a row with a number that is not finite; leave it out.")
     return rows

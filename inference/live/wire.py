@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import struct
-from typing import Any
+from typing import Any, TypeVar
 
 import msgpack
 import numpy as np
@@ -16,8 +16,11 @@ from bcppl.arrays import Array
 from bcppl.errors import InputError
 
 LARGEST = 32 << 20  # bytes of a message: a depth image of 2048 x 2048 as float64
+GREETING = 1 << 10  # bytes of a client's first message, which is read before its token is known
+MOST = 1 << 12  # maps and lists of a message: a row of numbers may be a list
 DEEPEST = 6  # maps or lists within one another
 LENGTH = struct.Struct(">I")
+T = TypeVar("T")
 TYPES = {"float64": "<f8", "float32": "<f4"}
 
 
@@ -27,15 +30,15 @@ def packed(message: dict[str, Any]) -> bytes:
     return LENGTH.pack(len(body)) + body
 
 
-def length_of(header: bytes) -> int:
+def length_of(header: bytes, most: int = LARGEST) -> int:
     """The length of a message's body.
 
     Raises:
-        InputError: it is empty, or larger than is read.
+        InputError: it is empty, or larger than `most`.
     """
     (length,) = LENGTH.unpack(header)
-    if not 0 < length <= LARGEST:
-        raise InputError(f"a message of {length} bytes is announced; send 1 to {LARGEST}.")
+    if not 0 < length <= most:
+        raise InputError(f"a message of {length} bytes is announced; send 1 to {most}.")
     return int(length)
 
 
@@ -43,8 +46,18 @@ def unpacked(body: bytes) -> dict[str, Any]:
     """A message of its body.
 
     Raises:
-        InputError: it is no MessagePack map, or is nested too deeply, or one of its arrays is none.
+        InputError: it is no MessagePack map, holds too many maps and lists, is nested too deeply, or has an
+            array that is none.
     """
+    left = MOST
+
+    def counted(held: T) -> T:
+        nonlocal left
+        left -= 1
+        if left < 0:
+            raise InputError(f"a message holds more than {MOST} maps and lists; send arrays as bytes.")
+        return held
+
     try:
         read = msgpack.unpackb(
             body,
@@ -55,7 +68,11 @@ def unpacked(body: bytes) -> dict[str, Any]:
             max_array_len=1 << 20,
             max_map_len=1 << 10,
             max_ext_len=0,
+            list_hook=counted,
+            object_hook=counted,
         )
+    except InputError:
+        raise
     except Exception as error:  # the library raises its own, ValueError, and those of Unicode
         raise InputError(f"a message is no MessagePack ({type(error).__name__}); send one map.") from error
     if not isinstance(read, dict) or not all(isinstance(name, str) for name in read):

@@ -10,6 +10,7 @@ import typer
 
 from bcppl.arguments import LARGEST_SEED
 from bcppl.cli.options import AsJson, Given, InferenceName, ModelName, Of, Particles, Settings
+from bcppl.cli.outputs import refuse_overwriting
 from bcppl.errors import InputError
 
 if TYPE_CHECKING:
@@ -56,10 +57,9 @@ def insert(
     from bcppl.inference.planning.success import success_probability
     from bcppl.recordings.action_file import SUFFIXES, save_actions
 
-    if output.suffix not in SUFFIXES or not output.parent.is_dir():
-        raise InputError(
-            f"--output is {output}; give a file in a folder that exists, ending in {' or '.join(SUFFIXES)}."
-        )
+    if output.suffix not in SUFFIXES:
+        raise InputError(f"--output is {output}; give a file that ends in {' or '.join(SUFFIXES)}.")
+    refuse_overwriting("--output", output, recording, of, model, inference)
     box = None if workspace is None else _box(workspace)
     console = Console(highlight=False, stderr=as_json)
     found: dict[str, Any] = {"output": str(output)}

@@ -19,6 +19,7 @@ from bcppl.cli.options import (
     Settings,
     WorldFromBase,
 )
+from bcppl.cli.outputs import refuse_overwriting
 from bcppl.errors import InputError
 
 if TYPE_CHECKING:
@@ -72,15 +73,16 @@ def live(
     """Play a recording as if it were being made, and follow it: how late each update was, and the belief."""
     from rich.console import Console
 
+    from bcppl.cli import latent_sites
     from bcppl.cli.arm import arm_with_peg
     from bcppl.cli.report import Report
     from bcppl.inference.live import Filter, play
     from bcppl.recordings.beliefs import save_belief
     from bcppl.recordings.fingerprint import fingerprint
 
-    for file in filter(None, (out, save)):
-        if not file.parent.is_dir():
-            raise InputError(f"there is no folder {file.parent} to write {file.name} into; make it first.")
+    for option, file in (("--out", out), ("--save", save)):
+        if file is not None:
+            refuse_overwriting(option, file, recording)
     if robot is not None and not (view or save):
         raise InputError("--robot is drawn on a page; add --view or --save.")
     arm = arm_with_peg(robot, link, link_from_peg, world_from_base)
@@ -115,6 +117,7 @@ def live(
             label=last.info.label,
             log_evidence=last.info.log_evidence,
             random_state=last.random_state,
+            latent=latent_sites.values_of(last),
             of=fingerprint(following.recording, last.taken),
         )
         console.print(f"the belief is in {out}", markup=False)

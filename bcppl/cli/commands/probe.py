@@ -23,6 +23,7 @@ from bcppl.cli.options import (
     Settings,
     WorldFromBase,
 )
+from bcppl.cli.outputs import refuse_overwriting
 from bcppl.errors import InputError
 from bcppl.visible_text import visible
 
@@ -136,8 +137,7 @@ def probe(
     console.print(table_of_best)
     best = named_apart(ranking.best.candidate, now.recording)
     save_actions([best], output)
-    title = visible(name_of(best)).replace("$", r"\$")  # matplotlib reads formulas
-    shown = f"next: {title}", belief.world_from_part.numpy(), belief.log_weights.numpy()
+    shown = f"next: {name_of(best)}", belief.world_from_part.numpy(), belief.log_weights.numpy()
     alike = [c for c in listed if sensor_of(c) is sensor_of(best)]
     others = alike if planner_of(best).needs_peg else []
     figure = action_in_3d(now.recording.part, shown, best, now.recording.peg, others)
@@ -154,13 +154,9 @@ def _picture(output: Path, given: Sequence[str]) -> Path:
 
     if output.suffix not in SUFFIXES:
         raise InputError(f"--output is {output}; give a file that ends in {' or '.join(SUFFIXES)}.")
-    if not output.parent.is_dir():
-        raise InputError(f"there is no folder {output.parent} to write {output.name} into; make it first.")
     picture = output.with_suffix(".png")
     for file in (output, picture):
-        for name in given:
-            if file.exists() and Path(name).exists() and file.samefile(name):
-                raise InputError(f"--output would overwrite {name}, which is read; give another name.")
+        refuse_overwriting("--output", file, *given)
     return picture
 
 

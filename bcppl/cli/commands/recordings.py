@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import inspect
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -42,31 +42,39 @@ def check(
     from bcppl.sensors.plausibility import doubts
 
     loaded = load_recording(recording)
-    remarks = notes(loaded)
+    wrong = problems(loaded)
+    described, remarks, doubted = (_made(each, loaded, wrong) for each in (describe, notes, doubts))
     if Path(recording).is_file() and not is_checked(recording):
         remarks.append("the file has no checksum, so a changed number goes unnoticed: save it again for one.")
     console = Console(stderr=as_json)
     table = Table(show_header=False, box=None, pad_edge=False)
-    for what, value in describe(loaded):
+    for what, value in described:
         table.add_row(f"[bold]{what}[/bold]", escape(visible(value)))
     console.print(table)
-    for note in remarks:
-        console.print(f"[yellow]note:[/yellow] {escape(visible(note))}", highlight=False)
-    doubted = doubts(loaded)
-    for doubt in doubted:
-        console.print(f"[yellow]doubt:[/yellow] {escape(visible(doubt))}", highlight=False)
-    wrong = problems(loaded)
-    for problem in wrong:
-        console.print(f"[red]wrong:[/red] {escape(visible(problem))}", highlight=False)
+    for word, colour, lines in (
+        ("note", "yellow", remarks), ("doubt", "yellow", doubted), ("wrong", "red", wrong),
+    ):  # fmt: skip
+        for line in lines:
+            console.print(f"[{colour}]{word}:[/{colour}] {escape(visible(line))}", highlight=False)
     if as_json:
-        described = {"description": dict(describe(loaded)), "notes": remarks, "doubts": doubted}
-        print(json.dumps({**described, "problems": wrong}))
+        listed = {"description": dict(described), "notes": remarks, "doubts": doubted, "problems": wrong}
+        print(json.dumps(listed))
     if wrong:
         raise typer.Exit(2)
     if doubted:
         console.print(f"[yellow]no problem, but {len(doubted)} doubt{'s'[: len(doubted) > 1]}.[/yellow]")
         return
     console.print("[green]no problem.[/green]")
+
+
+def _made(make: Callable[[Recording], list[Any]], recording: Recording, wrong: Sequence[str]) -> list[Any]:
+    """What is made of a recording, or nothing where its problems prevent that: these are listed instead."""
+    try:
+        return make(recording)
+    except Exception:
+        if not wrong:
+            raise
+        return []
 
 
 def simulate(

@@ -128,6 +128,7 @@ def run(
                 "settings": settings,
                 "doubts": doubted,
             },
+            begun=resume is not None,
         )
     try:
         with sole_bar(console) as progress:
@@ -141,15 +142,20 @@ def run(
                 )
     finally:
         # Whatever stopped the run, what was computed is shown and kept.
-        if report.steps:
+        if not folder.history:
+            folder.discard()
+        else:
             folder.note(
                 warnings=report.finish(),
                 relative_to_peg=report.relative_deviations(),
                 complete=report.is_complete,
             )
-            folder.draw()
-            folder.write_page(report.conclusion, report.steps[-1])
-            console.print(f"beliefs and figures are in {folder.path}, all on one page in {PAGE}")
+            try:
+                folder.draw()
+            finally:
+                folder.write_page(report.conclusion, report.steps[-1])
+            where = f"beliefs and figures are in {folder.path}, all on one page in {PAGE}"
+            console.print(where, markup=False)
     if explain:
         folder.note(explanations=[each._asdict() for each in report.explain()])
     if as_json:

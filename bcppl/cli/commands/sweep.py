@@ -16,7 +16,7 @@ import typer
 
 from bcppl.arguments import LARGEST_SEED
 from bcppl.cli.options import Settings
-from bcppl.errors import InferenceError, InputError
+from bcppl.errors import InputError
 from bcppl.sweeps import key_of, product, swept
 
 RESULTS, TABLE, BELIEFS = "results.jsonl", "results.csv", "beliefs"  # in the folder
@@ -63,18 +63,21 @@ def sweep(
     from bcppl.inference.progress import watched
 
     named = _recordings(recordings or [], scenes, model or [])
-    models, programs = model or [""], inference or [""]
+    models, programs, settings = model or [""], inference or [""], _settings(set_ or [])
     cells = product(
         recording=named,
         model=models,
         inference=programs,
         particles=particles or [75],
-        settings=_settings(set_ or []),
+        settings=settings,
         seed=_numbers("--seeds", seeds),
     )
-    digests = {name: _digest(name) for name in {*named, *models, *programs}}
+    words = {v for each in settings for v in each.values() if isinstance(v, str)}
+    stated = {word for word in words if Path(word).is_file()}
+    digests = {name: _digest(name) for name in {*named, *models, *programs, *stated}}
     for cell in cells:
-        cell["contents"] = [digests[cell[name]] for name in FILES]
+        given = [each for each in cell["settings"].values() if isinstance(each, str) and each in stated]
+        cell["contents"] = [digests[name] for name in (*(cell[name] for name in FILES), *given)]
     number, shares = _share(share)
     with workers(backend):
         done = swept(
@@ -97,19 +100,13 @@ def sweep(
             if found:
                 console.print(_table(found))
                 _write(found, out / TABLE)
-                console.print(f"{len(found)} of {len(cells)} runs are in {out}")
-    failed = [result["failed"] for _, result in found if "failed" in result]
-    if failed:
-        raise InferenceError(f"{len(failed)} of {len(found)} runs failed, the first so: {failed[0]}")
+                console.print(f"{len(found)} of {len(cells)} runs are in {out}", markup=False)
 
 
 def of_cell(cell: Mapping[str, Any], here: Path, beliefs: Path) -> dict[str, Any]:
     """What came of one run, whose files are named from `here`; its last belief is written into a folder."""
     found = {**cell, **{name: str(here / cell[name]) for name in FILES if (here / cell[name]).is_file()}}
-    try:
-        return _followed(found, beliefs, hashlib.sha256(key_of(cell).encode()).hexdigest()[:16])
-    except (InputError, InferenceError) as error:
-        return {"failed": " ".join(str(error).split())}
+    return _followed(found, beliefs, hashlib.sha256(key_of(cell).encode()).hexdigest()[:16])
 
 
 def _followed(cell: Mapping[str, Any], beliefs: Path, name: str) -> dict[str, Any]:
@@ -254,7 +251,6 @@ def _table(found: Sequence[tuple[Mapping[str, Any], Mapping[str, Any]]]) -> Any:
     table = Table(box=None, pad_edge=False)
     columns = (
         "runs",
-        "failed",
         "ADD mm",
         "90 %",
         "worst",
@@ -267,19 +263,17 @@ def _table(found: Sequence[tuple[Mapping[str, Any], Mapping[str, Any]]]) -> Any:
     for name in (" ", *columns):
         table.add_column(name, justify="right" if name.strip() else "left")
     for name, results in sorted(groups.items()):
-        ran = [one for one in results if "failed" not in one]
-        adds = [one["add_mm"] for one in ran if "add_mm" in one]
-        held = [[one[HOLDS.format(100 * m)] for one in ran if "add_mm" in one] for m in MASSES]
-        spreads = [1e3 * math.sqrt(sum(s * s for s in one["spread"][:3])) for one in ran]
+        adds = [one["add_mm"] for one in results if "add_mm" in one]
+        held = [[one[HOLDS.format(100 * m)] for one in results if "add_mm" in one] for m in MASSES]
+        spreads = [1e3 * math.sqrt(sum(s * s for s in one["spread"][:3])) for one in results]
         table.add_row(
             name,
             str(len(results)),
-            str(len(results) - len(ran)),
             *[f"{np.quantile(adds, q):.2f}" if adds else "" for q in (0.5, 0.9, 1.0)],
             *[f"{100 * np.mean(each):.0f} %" if each else "" for each in held],
-            f"{np.median(spreads):.3f}" if ran else "",
-            str(sum(bool(one["warnings"]) for one in ran)),
-            f"{np.median([one['seconds'] for one in ran]):.2f}" if ran else "",
+            f"{np.median(spreads):.3f}",
+            str(sum(bool(one["warnings"]) for one in results)),
+            f"{np.median([one['seconds'] for one in results]):.2f}",
         )
     return table
 
