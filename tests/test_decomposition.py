@@ -47,6 +47,16 @@ def test_the_error_of_pieces_is_exact_on_both_sides() -> None:
     assert hausdorff_error(replace(solid, pieces=halves), count=500).largest < 1e-12
 
 
+@pytest.mark.parametrize("off", [0.0005, 0.005])
+def test_what_is_lost_beyond_an_edge_of_a_piece_is_the_distance_to_that_edge(off: float) -> None:
+    """A wedge, and a piece that is moved back from its edge: the planes are off by less than the edge."""
+    mesh = trimesh.creation.extrude_polygon(shapely.Polygon([(0, 0), (-0.04, 0.04), (-0.04, -0.04)]), 0.01)
+    wedge = Part("wedge", np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    back = Piece("hull", wedge.vertices - [off, 0.0, 0.0])
+    error = hausdorff_error(replace(wedge, pieces=[back]), count=500)
+    assert error.lost == pytest.approx(off, rel=1e-6) and error.added == pytest.approx(off, rel=1e-6)
+
+
 def test_a_convex_part_needs_no_coacd(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     def missing(name: str) -> str:
         raise importlib.metadata.PackageNotFoundError(name)

@@ -274,6 +274,15 @@ def test_lazy_under_a_plate() -> None:
     assert RENDERER.effort.since(before).items == 5
 
 
+@pytest.mark.parametrize("robust", [False, True])
+@pytest.mark.parametrize("far", [math.inf, math.nan, 0.01])
+def test_a_range_that_does_not_end_beyond_its_beginning_is_refused(robust: bool, far: float) -> None:
+    camera = replace(CAMERA, near=0.05, far=far)
+    kind = RobustDepth if robust else LaplaceDepth
+    with pytest.raises(InputError, match=r"'front' has a range from 0.05 m to .* above 0.05"):
+        kind(RENDERER, camera, poses_near(2), SCALE)
+
+
 def test_bad_input_is_named() -> None:
     pose = poses_near(4)
     pose[2, 1] = math.nan

@@ -25,7 +25,7 @@ from tests.command_line import Ran
 if not find_spec("warp"):  # an optional group
     pytest.skip("Warp is not installed", allow_module_level=True)
 
-from bcppl.distributions.depth import OccludedDepth, RobustDepth
+from bcppl.distributions.depth import LaplaceDepth, OccludedDepth, RobustDepth
 from bcppl.rendering.rasterisation import Rasteriser
 from tests.stand_in_device import GPU, There, stand_in
 
@@ -106,6 +106,20 @@ def test_the_likelihood_of_an_image_is_that_of_the_processor(
     apart = (found - expected).abs()
     assert float(apart.median()) < 0.01 and float(apart.max()) < 2.0
     assert float(expected.std()) > 10.0
+
+
+def test_one_image_is_compared_at_the_rays_of_each_camera(monkeypatch: pytest.MonkeyPatch) -> None:
+    recording = load_recording("peg_probe")
+    view = recording.measurements[0]
+    camera, image = view.action.camera, torch.as_tensor(view.observation.depth, dtype=torch.float64)
+    pose, renderer = torch.as_tensor(recording.truth)[None], Rasteriser(recording.part)
+    cameras = [camera, replace(camera, fx=1.05 * camera.fx), camera]
+    host = [LaplaceDepth(renderer, each, pose, scale=0.002).log_prob(image) for each in cameras]
+    with stand_in(monkeypatch):
+        there = [LaplaceDepth(renderer, each, pose.to(GPU), scale=0.002) for each in cameras]
+        found = [each.log_prob(image).cpu() for each in there]
+    assert found[0] == found[2] and abs(float(host[1] - host[0])) > 100.0
+    torch.testing.assert_close(found[1] - found[0], host[1] - host[0], rtol=0.02, atol=0.0)
 
 
 def test_the_command_runs_on_the_device_and_keeps_which(

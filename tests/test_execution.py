@@ -66,6 +66,16 @@ def test_a_single_sample_stops_nothing() -> None:
     assert executor.state == "finished" and not executor.stops
 
 
+def test_one_first_sample_of_a_stated_tare_is_not_two_in_a_row() -> None:
+    free, tare = descent(manners=("free", "free", "free")), np.array([0.0, 0.0, 3.0])
+    executor = Executor(free, tare=tare, limits=Limits(force=20.0))
+    executed(executor, wall=-1.0, hits={0: 100.0})
+    assert executor.state == "finished"
+    executor = Executor(free, tare=tare, limits=Limits(force=20.0))
+    executed(executor, wall=-1.0, hits={0: 100.0, 1: 100.0})
+    assert executor.state == "aborted" and executor.taken == 2
+
+
 def test_a_force_beyond_the_limit_aborts_and_holds_the_peg_where_it_is() -> None:
     free = descent(manners=("free", "free", "free"))
     executor = Executor(free, limits=Limits(force=15.0))

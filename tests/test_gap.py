@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import functools
 import math
+from dataclasses import replace
 
 import mujoco
 import numpy as np
 import pytest
 import torch
+import trimesh
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
@@ -17,7 +19,7 @@ from bcppl.contact.mujoco_model import ContactParameters, build_model
 from bcppl.errors import InputError
 from bcppl.geometry.extrusion import block, block_with_hole, box_peg, peg_for
 from bcppl.geometry.gap import PegGap
-from bcppl.geometry.outlines import round_outline
+from bcppl.geometry.outlines import named_outline, round_outline
 from bcppl.geometry.parts import Part
 from bcppl.models.worlds.bench.parts import bench_part
 
@@ -229,6 +231,26 @@ def test_centred_in_a_round_hole_it_is_half_the_clearance() -> None:
     assert np.all(np.abs(distance - 0.5 * clearance + np.abs(off)) < 0.012 * np.abs(off) + 1e-8)
 
 
+@pytest.mark.parametrize("facets", ["coarse", "fine"])
+def test_flat_sides_touch_a_ball_and_a_cylinder_however_finely_these_are_meshed(facets: str) -> None:
+    """At no vertex of the peg, and at edges that are as shallow as the meshes are fine."""
+    radius, heights = 0.01, np.array([0.001, 0.0, -0.001, -0.004])
+    levels, sides = {"coarse": (3, 64), "fine": (4, 96)}[facets]
+    ball = trimesh.creation.icosphere(levels, radius)
+    upright = trimesh.creation.cylinder(radius, 0.04, sections=sides)
+    above, beside = (
+        torch.stack([pose(np.array(place), Rotation.identity()) for place in each])
+        for each in (
+            [(0.0, 0.0, radius + h + LENGTH) for h in heights],
+            [(radius + h + HALF, 0.0, 0.5 * LENGTH) for h in heights],
+        )
+    )
+    for mesh, peg in ((ball, above), (upright, beside)):
+        part = Part("round", np.asarray(mesh.vertices), np.asarray(mesh.faces, dtype=np.int64))
+        gap = PegGap(part, box_peg(2 * HALF, LENGTH))(poses.identity(1), peg)
+        np.testing.assert_allclose(gap.distance[0].numpy(), heights, atol=2e-6)
+
+
 def test_gradients_are_finite_differences() -> None:
     turns = [Rotation.from_rotvec([0.1, 0.05, z]) for z in np.linspace(0, 1.5, 15)]
     flat = torch.stack([pose(np.array([0.01, 0.0, LENGTH - 1e-3]), turn) for turn in turns])
@@ -296,3 +318,15 @@ def test_an_open_part_is_refused() -> None:
     whole = block((0.02, 0.02, 0.01))
     with pytest.raises(InputError, match="open"):
         PegGap(Part("lid off", whole.vertices, whole.faces[:-1]), box_peg(0.008, 0.05))
+
+
+def test_a_peg_that_is_not_convex_needs_its_pieces_and_a_part_does_not() -> None:
+    """The hull of a peg with a feather fills the corners beside it: it would touch where nothing does."""
+    hole, clearance = named_outline("keyway", 0.016), 0.0002
+    part, peg = replace(block_with_hole(hole), pieces=()), peg_for(hole, clearance, LENGTH)
+    centred = pose(np.array([0.0, 0.0, LENGTH - 0.01]), Rotation.identity())[None]
+    assert PegGap(part, peg)(poses.identity(1), centred).distance.item() == pytest.approx(
+        0.5 * clearance, rel=1e-4
+    )
+    with pytest.raises(InputError, match=r"peg.*no convex pieces"):
+        PegGap(part, replace(peg, pieces=()))

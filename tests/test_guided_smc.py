@@ -222,7 +222,7 @@ def test_a_model_without_sensors_and_numbers_out_of_range_are_refused_in_a_sente
     with pytest.raises(InputError, match="needs a scene with a prior and sensors") as caught:
         list(infer(MODEL, RECORDING))
     assert_one_sentence(str(caught.value))
-    for numbers in ({"particles": 0}, {"sweeps": 0}, {"share": 1.5}):
+    for numbers in ({"particles": 0}, {"sweeps": 0}, {"threshold": 1.5}):
         with pytest.raises(InputError):
             infer(MODEL, RECORDING, **numbers)
 

@@ -56,6 +56,7 @@ from bcppl.models.worlds.bench.parameters import BenchParameters
 from bcppl.models.worlds.bench.scene import bench_scene
 from bcppl.robot.motion import ProbeWindow
 from bcppl.sensors.likelihoods.bench_profiles import PROFILES, BenchProfile
+from bcppl.sensors.likelihoods.contact_probe import TouchSettings
 from bcppl.sensors.measurements import Measurement, Recording
 from tests.episode_errors import factors
 from tests.made_recordings import assert_one_sentence
@@ -135,6 +136,17 @@ def dense(pose: Tensor, rows: Tensor, errors: LinearErrors, extra: Tensor | None
         gaps = ledge(pose, moved(rows[:, :7], twist)).distance
         each.append(MultivariateNormal(mean, covariance).log_prob(gaps) + math.log(probability))
     return torch.logsumexp(torch.stack(each), dim=0)
+
+
+def test_errors_of_one_name_are_refused_and_a_list_is_a_bench() -> None:
+    twice = [PartSlides(), Grasp(), PartSlides(shift=0.002)]
+    for make in (LinearErrors, lambda given: TouchSettings(bench=given)):
+        with pytest.raises(InputError, match=r"2 errors with the name \"the part's place") as caught:
+            make(twice)
+        assert_one_sentence(str(caught.value))
+    assert hash(TouchSettings(bench=[Grasp(), Size()])) == hash(TouchSettings(bench=(Grasp(), Size())))
+    listed = LinearErrors([Grasp()]).effect_again(FIVE)
+    assert torch.equal(listed.twist, LinearErrors((Grasp(),)).effect(FIVE).twist)
 
 
 def test_the_filter_is_the_dense_gaussian_and_each_error_matters() -> None:

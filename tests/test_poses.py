@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
+from torch.distributions import MultivariateNormal
 
 from bcppl import poses, quaternions
-from bcppl.distributions.poses import NormalPose, SwingTwistPose, UniformPose, tilt_and_yaw
+from bcppl.distributions.poses import NormalPose, NormalTwist, SwingTwistPose, UniformPose, tilt_and_yaw
 from bcppl.errors import InputError
 from bcppl.poses import Freedom
 
@@ -96,6 +97,42 @@ def test_samples_follow_the_density(name: str) -> None:
     estimate = (inside / density.exp()).double()
     error = estimate.std() / math.sqrt(DRAWS)
     assert abs(estimate.mean() - measure) <= 4 * error + 1e-9
+
+
+@pytest.mark.parametrize("kind", ["about all axes", "about one axis", "over twists"])
+def test_a_wide_normal_has_at_its_centre_the_density_beside_it(kind: str) -> None:
+    wide = {
+        "about all axes": NormalPose(CENTER, [0.01, 0.02, 0.01, 0.6, 0.7, 0.5]),
+        "about one axis": NormalPose(CENTER, [[1e-4, 0.01], [0.01, 4.0]], Freedom("x", "z")),
+        "over twists": NormalTwist(CENTER, [0.01, 0.02, 0.01, 0.6, 0.7, 0.5]),
+    }[kind]
+    turn = torch.zeros(6, dtype=torch.float64)
+    turn[5] = 1e-6
+    beside = wide.log_prob(poses.retract(CENTER, turn))
+    assert float(wide.log_prob(CENTER)) == pytest.approx(float(beside), abs=1e-5)
+    # As many turns more as count, exactly.
+    if kind == "about one axis":
+        angles = 2.0 * math.pi * torch.arange(-1, 2, dtype=torch.float64)
+        terms = [
+            MultivariateNormal(torch.zeros(2, dtype=torch.float64), wide.covariance).log_prob(
+                torch.stack([torch.zeros_like(angle), angle])
+            )
+            for angle in angles
+        ]
+        exact = torch.logsumexp(torch.stack(terms), dim=0) + math.log(2.0 * math.pi)
+        torch.testing.assert_close(wide.log_prob(CENTER), exact)
+
+
+@pytest.mark.parametrize("angle", [1e-8, 1e-4, 0.0099, 0.0101])
+def test_uniform_priors_within_a_tiny_angle_have_its_measure_and_draws(angle: float) -> None:
+    ball, cone = UniformPose(CENTER, 0.02, angle), SwingTwistPose(CENTER, 0.02, angle, math.pi)
+    box = 3.0 * math.log(0.04)
+    exact = 3.0 * math.log(angle) - math.log(6.0 * math.pi) + math.log1p(-(angle**2) / 20.0)
+    assert float(ball.log_prob(CENTER)) == pytest.approx(-box - exact, abs=1e-9)
+    small = 2.0 * math.log(0.5 * angle) + math.log1p(-(angle**2) / 12.0)
+    assert float(cone.log_prob(CENTER)) == pytest.approx(-box - small, abs=1e-9)
+    turned = poses.local(CENTER, ball.sample(torch.Size([20_000])))[:, 3:].norm(dim=-1) / angle
+    assert float((turned**3).mean()) == pytest.approx(0.5, abs=0.01)  # uniform, to rounding
 
 
 def test_retract_and_local_are_inverse() -> None:

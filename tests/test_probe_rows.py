@@ -150,6 +150,14 @@ def test_a_tap_of_forty_milliseconds_is_used_at_every_rate(profile: str) -> None
         assert len(rows) < 120, "rows are as many as their time is worth"
 
 
+@pytest.mark.parametrize("delays", [(), (0.01, 0.02)])
+def test_a_cell_without_stamps_has_no_rows(delays: tuple[float, ...]) -> None:
+    rows = EpisodeExtractor(ContactDetector(), 0.01, delays).rows(
+        np.empty(0), np.empty((0, 7)), np.empty((0, 6)), True
+    )
+    assert len(rows.felt) == 0 and rows.earlier.shape == (0, len(delays), 7)
+
+
 class _Hasty(EpisodeExtractor):
     """Mutant: a stamp is decided at once, before what surrounds it is known."""
 

@@ -110,6 +110,21 @@ def test_a_mask_and_a_depth_image_are_rendered_once() -> None:
     assert torch.allclose(4.0 * both[1], whole)
 
 
+@pytest.mark.parametrize("images", [0, 1, 2])
+def test_a_mask_has_pixels_outside_the_region_of_a_depth_image_that_was_compared_before(images: int) -> None:
+    image = torch.from_numpy(RENDERER.images(CAMERA, TRUTH[None])[0])
+    image[~torch.isfinite(image)] = 1.0
+    left = np.zeros(image.shape, dtype=bool)
+    left[:, : CAMERA.width // 2] = True
+    depth = RobustDepth(RENDERER, CAMERA, moved(0.004, 0.03), 0.003, region=left)
+    compared = [depth.log_prob(image) for _ in range(images)]
+    beside = Silhouette.from_depth(depth, 1.0, 0.02)
+    whole = Silhouette(RENDERER, CAMERA, moved(0.004, 0.03), 1.0, 0.02)
+    torch.testing.assert_close(beside.log_prob(shown()), whole.log_prob(shown()))
+    for each in compared:
+        torch.testing.assert_close(depth.log_prob(image), each)
+
+
 def test_a_mask_is_binned_by_most_of_its_pixels() -> None:
     mask = np.zeros((5, 6))
     mask[:2, :3], mask[2, 4:] = 255, 1

@@ -190,6 +190,15 @@ def test_direction_is_inward_and_leans_with_the_motion() -> None:
     assert float(straight_on.log_prob(t(0.0)[0])) > float(straight_on.log_prob(t(math.pi)[0])) + 3.0
 
 
+@pytest.mark.parametrize("along", [1.0, -0.01])
+def test_a_vertical_motion_leaves_the_force_along_the_normal_of_every_side(along: float) -> None:
+    angles = torch.linspace(-math.pi, math.pi, 721, dtype=torch.float64)[:-1]
+    sides = {0.0: t(-0.0502, 0, 0), 0.5 * math.pi: t(0, -0.1002, 0), -0.5 * math.pi: t(0, 0.1002, 0)}
+    for inward, tip in sides.items():
+        density = direction(shifted(*[0.0] * 720), t(0.0, 0.0, along), tip).log_prob(angles)
+        assert float(angles[density.argmax()]) == pytest.approx(inward, abs=1e-9)
+
+
 def test_direction_samples_follow_the_density() -> None:
     torch.manual_seed(1)
     many = direction(shifted(*[0.0] * 20000), t(1.0, 0.3, 0.0), outlier=0.2).sample()

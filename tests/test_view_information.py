@@ -16,7 +16,7 @@ from bcppl.inference.design.rules import by_linearised_gain
 from bcppl.inference.population import Population
 from bcppl.models.look_and_touch import model
 from bcppl.models.worlds.bench.scene import bench_scene
-from bcppl.rendering.information import pixel_information
+from bcppl.rendering.information import STEPS, pixel_information
 from bcppl.rendering.ray_casting import RayCaster
 from bcppl.sensors import View
 from bcppl.sensors.candidates import with_candidates
@@ -53,6 +53,32 @@ def test_surfaces_out_of_the_sensors_range_are_uninformative() -> None:
     for near, far in ((0.05, 0.2), (0.4, 2.0)):
         blind = replace(from_above(0.3), near=near, far=far)
         assert not pixel_information(renderer, blind, poses.identity(1)).any()
+
+
+def test_pixels_that_a_step_takes_off_the_part_inform_nothing() -> None:
+    # The outermost pixels see it 0.2 mm from its edge.
+    renderer, camera = RayCaster(block((0.0934, 0.08, 0.005))), from_above(0.3)
+    steps = torch.diag(torch.tensor(STEPS, dtype=torch.float64))
+    moved = torch.cat([poses.retract(poses.identity(6), sign * steps) for sign in (1.0, -1.0)])
+    there = np.isfinite(renderer.images(camera, torch.cat([poses.identity(1), moved])))
+    kept = int(there.all(axis=0).sum())
+    assert kept < there[0].sum() - 20
+    information = pixel_information(renderer, camera, poses.identity(1))[0]
+    assert float(information[6, 6]) == kept
+    assert float(information[2, 2]) == pytest.approx(kept, rel=1e-3)
+
+
+def test_a_part_at_the_border_of_an_image_informs_little_and_beside_it_nothing() -> None:
+    renderer, camera = RayCaster(block((0.04, 0.04, 0.02))), from_above(0.3)
+    height = []
+    for x in np.linspace(0.09, 0.2, 45):  # m: less of it is in the image than a bin is wide, then none
+        part = poses.identity(1)
+        part[0, 0] = x
+        height.append(float(pixel_information(renderer, camera, part, bins=4)[0, 2, 2]))
+    assert height[0] > 1.0 and height[-1] == 0.0
+    behind = poses.identity(1)
+    behind[0, 2] = 1.0
+    assert not pixel_information(renderer, camera, behind, bins=4).any()
 
 
 def test_the_cameras_error_bounds_its_information_and_a_second_image_adds_less() -> None:

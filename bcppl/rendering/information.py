@@ -10,7 +10,7 @@ from bcppl import poses
 from bcppl.arrays import Array
 from bcppl.geometry.camera import Camera
 from bcppl.rendering.part_renderer import PartRenderer
-from bcppl.rendering.region_of_interest import region_of_interest
+from bcppl.rendering.region_of_interest import UnseenError, region_of_interest
 
 # Steps of the differences; with smaller ones a ray's jumps from face to face dominate.
 STEPS = (5e-4, 5e-4, 5e-4, 5e-3, 5e-3, 5e-3)
@@ -23,22 +23,29 @@ def pixel_information(renderer: PartRenderer, camera: Camera, part: Tensor, bins
 
     The gradient of a pixel's depth is with respect to the part's pose (N, 7), in its tangent space, and to a
     range bias. Pixels at which the part appears or disappears, or that are out of the sensor's range, are
-    left out. With `bins` one pixel stands for a square of so many.
+    left out: the sum is zero where no pixel shows the part. With `bins` one pixel stands for a square of so
+    many.
     """
     middle = part[0].numpy()
     spread = float((part[:, :3] - part[0, :3]).norm(dim=1).max())
-    near = camera.cropped(*region_of_interest(camera, renderer.part, middle, WITHIN + spread)).binned(bins)
-    gradients = []
+    try:
+        region = region_of_interest(camera, renderer.part, middle, WITHIN + spread, bins)
+    except UnseenError:
+        return torch.zeros(len(part), 7, 7, dtype=torch.float64)
+    near = camera.cropped(*region).binned(bins)
+    # A pixel that one step takes off the part, or on to it, has no gradient along any axis.
+    kept = np.isfinite(_read(renderer, near, part))
+    changes = []
     for axis, step in enumerate(STEPS):
         away = torch.zeros(6, dtype=torch.float64)
         away[axis] = step
         ahead, behind = (_read(renderer, near, poses.retract(part, s * away)) for s in (1.0, -1.0))
         with np.errstate(invalid="ignore"):
             change = ahead - behind
-        change = np.where(np.isfinite(change) & (np.abs(change) < JUMP), change, 0.0)
-        gradients.append(torch.from_numpy(change.reshape(len(part), -1) / (2.0 * step)))
-    sees = np.isfinite(_read(renderer, near, part)).reshape(len(part), -1)
-    rows = torch.stack([*gradients, torch.from_numpy(sees.astype(np.float64))], dim=1)
+            kept &= np.abs(change) < JUMP  # not where one of them is NaN or infinite
+        changes.append(change / (2.0 * step))
+    gradients = np.where(kept, np.stack([*changes, np.ones_like(changes[0])]), 0.0)
+    rows = torch.from_numpy(gradients).flatten(2).transpose(0, 1)
     return rows @ rows.transpose(-1, -2)
 
 

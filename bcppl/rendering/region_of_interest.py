@@ -14,6 +14,10 @@ from bcppl.geometry.camera import OPTICAL, Camera
 from bcppl.geometry.parts import Part
 
 
+class UnseenError(InputError):
+    """No pixel of a camera can show a part."""
+
+
 def region_of_interest(
     camera: Camera, part: Part, world_from_part: npt.ArrayLike, within: float, least: int = 1
 ) -> tuple[int, int, int, int]:
@@ -30,7 +34,8 @@ def region_of_interest(
         Numbers of pixels; the whole image where the part may be partly behind the camera.
 
     Raises:
-        InputError: the camera's pose or intrinsics are invalid, or no pixel can show the part.
+        InputError: the camera's pose or intrinsics are invalid.
+        UnseenError: no pixel can show the part.
     """
     camera_from_world = poses.inverse(camera.stated_pose())
     expected = poses.as_pose(world_from_part)
@@ -44,12 +49,12 @@ def region_of_interest(
         f"camera {camera.name!r} cannot see part {part.name!r} within {within:.3g} m of where it is expected"
     )
     if (corners[:, 2] <= 0.0).all():
-        raise InputError(f"{unseen}: that is behind it; {OPTICAL}, or leave its views out.")
+        raise UnseenError(f"{unseen}: that is behind it; {OPTICAL}, or leave its views out.")
     if not np.isfinite(pixel).all():
         return 0, 0, camera.width, camera.height
     size = np.array([camera.width, camera.height])
     if (pixel.max(axis=0) < -0.5).any() or (pixel.min(axis=0) > size - 0.5).any():
-        raise InputError(
+        raise UnseenError(
             f"{unseen}: that is beside its image; correct its world_from_camera or the guess, or leave its "
             "views out."
         )

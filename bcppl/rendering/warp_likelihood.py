@@ -17,6 +17,7 @@ from bcppl import poses, warp_arrays
 from bcppl.arrays import Array
 from bcppl.devices import beside
 from bcppl.geometry.camera import Camera
+from bcppl.geometry.distortion import Optics
 
 # Sums of each particle, at least, so that neighbouring threads cast neighbouring rays, and threads in all.
 STRIPES, THREADS = 64, 1 << 20
@@ -133,8 +134,9 @@ class CastImages:
     def __init__(self, mesh: Any, center: Array, radius: float, device: torch.device) -> None:
         self._mesh, self._radius, self._device = mesh, radius, device
         self._center = torch.as_tensor(center, dtype=torch.float64, device=device)
-        # The numbers of the newest images, which the particles of many calls are compared with.
-        self._images: dict[int, tuple[Any, Image]] = {}
+        # The numbers of the newest images, which the particles of many calls are compared with. One image may
+        # be compared at the rays of several cameras, as where intrinsics are estimated.
+        self._images: dict[tuple[int, Optics, bool], tuple[Any, Image]] = {}
 
     def gains(self, camera: Camera, camera_from_part: Tensor, seen: Any, law: Any, bias: Tensor) -> Tensor:
         """By how much a part at poses (N, 7) changes the log-density of images, (N,).
@@ -177,9 +179,9 @@ class CastImages:
         return total
 
     def _image(self, camera: Camera, seen: Any) -> Image:
-        key = id(seen.depth)
+        key = id(seen.depth), camera.optics, bool(seen.moves)
         known = self._images.get(key)
-        if known is not None and known[0] is seen.depth and known[1].moves == int(seen.moves):
+        if known is not None and known[0] is seen.depth:
             return known[1]
         which = np.flatnonzero(seen.valid.any(axis=0))
 

@@ -157,7 +157,8 @@ class Executor:
         if number < TARE and self._tare is None:
             return False
         rest = np.mean(self._forces[:TARE], axis=0) if self._tare is None else self._tare
-        return bool((np.linalg.norm(np.array(self._forces[-SUSTAINED:]) - rest, axis=1) > force).all())
+        newest = np.array(self._forces[-SUSTAINED:]) - rest
+        return len(newest) == SUSTAINED and bool((np.linalg.norm(newest, axis=1) > force).all())
 
     def _stops(self, number: int, of: int, world_from_peg: Callable[[], Array]) -> bool:
         """Whether a motion is to be stopped, after the sample of a number."""

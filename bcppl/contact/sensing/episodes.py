@@ -269,7 +269,7 @@ def _rows(
 
     smooth = _continuous(pose)
     earlier = np.empty((len(groups), len(delays), 7))
-    for k, delay in enumerate(delays):
+    for k, delay in enumerate(delays if groups else ()):  # without stamps nothing lies between them
         then = [np.interp(time - delay, time, column) for column in smooth.T]
         earlier[:, k] = averaged(np.column_stack(then))
     mean = averaged(smooth)

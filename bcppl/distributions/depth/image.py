@@ -16,6 +16,7 @@ from scipy.special import ndtr
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.arguments import number_within
 from bcppl.devices import beside, is_on_host, numbers
 from bcppl.distributions.checks import Check
 from bcppl.distributions.depth.camera_image import CameraImage
@@ -94,7 +95,11 @@ class DepthDistribution(CameraImage):
                 "camera's stated pose; give no background, or render it as a part of the scene "
                 "(bcppl.rendering.scene.background_part)."
             )
-        self._log_uniform = -math.log(self.camera.far - self.camera.near)
+        # Some pixels are uniform over the range. A camera's own may be infinite: it renders as well.
+        what = f"{self._where} has a range from"
+        near = number_within(f"{what} {{}} m", self.camera.near)
+        far = number_within(f"{what} {near:g} m to {{}} m", self.camera.far, above=near)
+        self._log_uniform = -math.log(far - near)
 
     # ---- a subclass defines the law of a pixel
 

@@ -74,7 +74,9 @@ class CachedHits:
 
     def keep_all(self) -> CachedHits:
         """Itself, which renders every pixel at its first call: for images that count different ones."""
-        self._called, self._region = True, None
+        self._called = True
+        if self._region is not None:
+            self._region, self._every = None, None  # what was cached lacks the pixels outside
         return self
 
     def __call__(self, counted: Mask) -> PixelHits:

@@ -8,6 +8,7 @@ sees a particle. `ContactEpisodes` integrates the parameters out. `nuisances` ha
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -18,6 +19,7 @@ from torch import Tensor
 
 from bcppl.devices import HOST, on_host
 from bcppl.distributions.episodes.rows import COLUMNS, late
+from bcppl.errors import InputError
 
 
 class Effect(NamedTuple):
@@ -93,10 +95,23 @@ class LinearErrors:
     """Several errors together, and which parameters are whose.
 
     Attributes:
-        errors: each error.
+        errors: each error, its name its own.
+
+    Raises:
+        InputError: two errors have one name, by which their parameters are known.
     """
 
     errors: tuple[LinearError, ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "errors", tuple(self.errors))  # effects are cached: a list has no hash
+        count = Counter(error.name for error in self.errors)
+        twice = [name for name in count if count[name] > 1]
+        if twice:
+            raise InputError(
+                f"a bench has {count[twice[0]]} errors with the name {twice[0]!r}, by which parameters are "
+                "known; give one of each kind, or another name to one of your own."
+            )
 
     @cached_property
     def slices(self) -> Mapping[str, slice]:

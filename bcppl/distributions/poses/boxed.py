@@ -5,15 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+from scipy.special import ndtri_exp
 from torch import Tensor
-from torch.special import log_ndtr, ndtr, ndtri
+from torch.special import log_ndtr
 
 from bcppl import poses
+from bcppl.devices import beside, numbers
 from bcppl.distributions.poses.base import PoseDistribution
 from bcppl.distributions.poses.normal import NormalPose
-
-_LEAST = 1e-300
-_FARTHEST = 30.0  # standard deviations: beyond, the remaining mass of a tail is rounding
 
 
 class BoxedNormal(PoseDistribution):
@@ -65,11 +64,16 @@ class BoxedNormal(PoseDistribution):
             own = (before <= here).sum(dim=-1, keepdim=True) - 1
             within = ((here - before.gather(-1, own)) / mass.gather(-1, own)).clamp(0.0, 1.0)
             first, last, flip = (each.gather(-1, own) for each in (first, last, flip))
-            # The quantile is counted from the left end, which is the last where the interval is mirrored.
-            share = ndtr(first) + within * (ndtr(last) - ndtr(first))
-            drawn = ndtri(share.clamp(min=_LEAST)).clamp(first, last)
+            # The quantile is counted from the left end, which is the last where the interval is mirrored. Its
+            # distribution function is 0 by rounding beyond eight standard deviations, its logarithm is not.
+            below, beyond = log_ndtr(first) + torch.log1p(-within), log_ndtr(last) + within.log()
+            quantile = ndtri_exp(numbers(torch.logaddexp(below, beyond).detach()))
+            drawn = beside(quantile, first).clamp(first, last)
             score[..., axis] = torch.where(flip, -drawn, drawn)[..., 0]
-        return poses.retract(self.center, (scale @ score[..., None])[..., 0])
+        pose = poses.retract(self.center, (scale @ score[..., None])[..., 0])
+        # At an end of the box the sum of centre and deviation may round to outside.
+        pose[..., :3] = pose[..., :3].clamp(self.limits[0], self.limits[-1])
+        return pose
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Log-density (N,) with respect to Lebesgue times Haar; -inf outside the box."""
@@ -96,10 +100,6 @@ class BoxedNormal(PoseDistribution):
         first, last = ends[..., :-1], ends[..., 1:]
         flip = first > 0.0
         first, last = torch.where(flip, -last, first), torch.where(flip, -first, last)
-        first, last = (
-            first.clamp(min=-_FARTHEST),
-            torch.maximum(last, first.clamp(min=-_FARTHEST) + 1e-9),
-        )
         return first, last, flip, log_mass(first, last) + self.log_steps
 
 

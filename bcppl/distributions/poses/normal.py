@@ -16,6 +16,8 @@ from bcppl.distributions.poses.base import HELD, PoseDistribution, is_unit
 from bcppl.errors import InputError
 from bcppl.poses import FREE, Freedom
 
+_AT_CENTER = 1e-9  # rad: a smaller turn has no axis
+
 
 class NormalPose(PoseDistribution):
     """Normal in the tangent space at a pose, pushed forward by `poses.retract`, its Jacobian included.
@@ -107,18 +109,30 @@ class NormalPose(PoseDistribution):
         size = self.freedom.dimension * math.log(2.0 * math.pi)
         return -0.5 * (size + white[..., 0].square().sum(dim=-1)) - self._half_log_determinant
 
+    def _wound(self, tangent: Tensor, angle: Tensor, winding: float) -> Tensor:
+        """Tangents (..., 6), which turn by angles (...,), turned by a winding more about the same axes."""
+        stretch = 1.0 + winding / angle.clamp_min(_AT_CENTER)
+        turn = tangent[..., 3:] * stretch[..., None]
+        # At the centre any free axis is the same.
+        axis = torch.zeros_like(turn)
+        axis[..., self.freedom.axes[-1] - 3] = winding
+        turn = torch.where((angle < _AT_CENTER)[..., None], axis, turn)
+        return torch.cat([tangent[..., :3], turn], dim=-1)
+
     def log_prob(self, value: Tensor) -> Tensor:
         """Log-density (...,) with respect to the base measure; -inf where a held axis differs."""
         tangent = poses.local(self.center, value)
         angle = tangent[..., 3:].norm(dim=-1)
         terms = []
         for winding in self._windings:
-            wound = tangent
-            if winding:
-                stretch = 1.0 + winding / angle.clamp_min(1e-12)
-                wound = torch.cat([tangent[..., :3], tangent[..., 3:] * stretch[..., None]], dim=-1)
+            wound = self._wound(tangent, angle, winding) if winding else tangent
             drawn, base = self._measured(wound, angle + winding)
-            terms.append(self._log_normal(self.freedom.coordinates(drawn)) - base)
+            term = self._log_normal(self.freedom.coordinates(drawn)) - base
+            if winding and self.freedom.rotation == "all":
+                # All turns by 2 pi end at the centre. There the density over Haar measure has a pole, of
+                # hardly any mass: the value is that beside it.
+                term = torch.where(angle < _AT_CENTER, -torch.inf, term)
+            terms.append(term)
         density = terms[0] if len(terms) == 1 else torch.logsumexp(torch.stack(terms), dim=0)
         possible = (self.freedom.off_axis(tangent) <= HELD) & is_unit(value)
         return torch.where(possible, density, -torch.inf)

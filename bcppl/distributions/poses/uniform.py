@@ -11,6 +11,7 @@ from torch import Tensor
 
 from bcppl import poses, quaternions
 from bcppl.arguments import number_within
+from bcppl.arrays import Array
 from bcppl.devices import beside, numbers
 from bcppl.distributions.parameters import Range
 from bcppl.distributions.poses.base import HELD, PoseDistribution, is_unit
@@ -103,7 +104,7 @@ class UniformPose(_BoxPose):
         self.angle = ANGLE.checked("UniformPose has angle = {} rad", angle)
         if self.angle == 0.0:
             rotation = "none"
-        ball = (self.angle - math.sin(self.angle)) / math.pi
+        ball = float(_beyond_sine(np.array(self.angle))) / math.pi
         measure = {"none": 1.0, "all": ball}.get(rotation, self.angle / math.pi)
         super().__init__(center, translation, rotation, measure, tail)
 
@@ -136,9 +137,15 @@ def _haar_angle(shape: torch.Size, largest: float) -> Tensor:
     # Inverse of the distribution function a - sin a by a fine table: exact to 1e-9 of the range.
     table = np.linspace(0.0, largest, 20001)
     uniform = torch.rand(*shape, dtype=torch.float64)
-    cumulative = table - np.sin(table)
+    cumulative = _beyond_sine(table)
     angle = np.asarray(np.interp(numbers(uniform) * cumulative[-1], cumulative, table))
     return beside(angle, uniform)
+
+
+def _beyond_sine(angle: Array) -> Array:
+    """By how much angles (...,) exceed their sines, radians: by a series where the difference is rounding."""
+    series = angle**3 / 6.0 * (1.0 - angle**2 / 20.0 * (1.0 - angle**2 / 42.0))
+    return np.where(angle < 0.01, series, angle - np.sin(angle))
 
 
 class SwingTwistPose(_BoxPose):
@@ -169,7 +176,8 @@ class SwingTwistPose(_BoxPose):
                 "give yaw a small positive limit."
             )
         rotation = "all" if self.tilt > 0 else "z" if self.yaw > 0 else "none"
-        swing = 0.5 * (1.0 - math.cos(self.tilt)) if self.tilt > 0 else 1.0
+        # Half of 1 - cos a, which is rounding for a small tilt.
+        swing = math.sin(0.5 * self.tilt) ** 2 if self.tilt > 0 else 1.0
         twist = self.yaw / math.pi if self.yaw else 1.0
         super().__init__(center, translation, rotation, swing * twist, tail)
 

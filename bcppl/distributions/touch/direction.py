@@ -16,7 +16,7 @@ from bcppl.distributions.lazy import LazyDistribution
 from bcppl.distributions.touch.outliers import touch_check
 from bcppl.distributions.touch.placed import LATENT_POSITIVE, OUTLIER, Distance, Placed, Scale, distance_at
 
-# A normal with less than this in the world's xy plane has no direction there.
+# A unit vector with less than this in the world's xy plane has no direction there.
 UPRIGHT = 1e-6
 LOG_PEAK = math.log(2.0 / (math.pi * math.sqrt(3.0)))  # of the t with 3 degrees of freedom at 0
 
@@ -39,8 +39,8 @@ class ForceDirection(LazyDistribution):
     freedom. With the scale that the first log has, the t is better than a normal by 14 nats on the third, and
     worse by 2 on the second.
 
-    Where the surface faces straight up or down the angle is uniform. Without contact (tip NaN) the direction
-    is NaN with probability one.
+    A vertical motion turns it to neither side. Where the surface faces straight up or down the angle is
+    uniform. Without contact (tip NaN) the direction is NaN with probability one.
 
     Args:
         distance: the signed distance to the part.
@@ -75,6 +75,9 @@ class ForceDirection(LazyDistribution):
         inward = torch.atan2(-normal[:, 1], -normal[:, 0])
         cone = torch.atan(torch.as_tensor(self.friction, dtype=torch.float64))
         turn = _wrapped(torch.atan2(self.motion[:, 1], self.motion[:, 0]) - inward)
+        # Along a vertical motion friction has no part in the plane: it turns the force to neither side.
+        upright = self.motion[:, :2].norm(dim=-1) <= UPRIGHT * self.motion.norm(dim=-1)
+        turn = torch.where(upright, 0.0, turn)
         return inward + cone * torch.tanh(turn / cone), normal[:, :2].norm(dim=-1) > UPRIGHT, touched
 
     def log_prob(self, value: Tensor) -> Tensor:

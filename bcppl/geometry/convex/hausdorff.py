@@ -87,17 +87,17 @@ def _outside(points: Array, solids: list[trimesh.Trimesh]) -> Array:
     for solid in solids:
         close = np.flatnonzero(_beyond_box(points.T, solid) < beyond)
         beyond[close] = np.minimum(beyond[close], _beyond_planes(points[close], solid))
-    # The farthest plane decides between inside and outside, and bounds the distance to the surface below.
+    # The farthest plane decides between inside and outside. It only bounds the distance to the surface below:
+    # beyond an edge or a vertex that is more.
     distance, outside = np.where(beyond > 1e-9, np.inf, 0.0), np.flatnonzero(beyond > 1e-9)
     for solid in solids:
-        least = np.minimum(distance, beyond + 1e-4)[outside]
-        close = outside[_beyond_box(points[outside].T, solid) < least]
+        close = outside[_beyond_box(points[outside].T, solid) < distance[outside]]
         close = close[_beyond_planes(points[close], solid) < distance[close]]
         if len(close):
             corners, faces = np.array(solid.vertices), np.array(solid.faces, dtype=np.int64)
             squared = igl.point_mesh_squared_distance(np.ascontiguousarray(points[close]), corners, faces)[0]
             distance[close] = np.minimum(distance[close], np.sqrt(squared))
-    return np.where(np.isfinite(distance), distance, beyond)
+    return distance
 
 
 def _beyond_box(columns: Array, solid: trimesh.Trimesh) -> Array:

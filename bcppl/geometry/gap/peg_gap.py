@@ -71,7 +71,7 @@ class PegGap:
         effort: calls, and pairs of poses as `items`.
 
     Raises:
-        InputError: a mesh is empty, open or not finite.
+        InputError: a mesh is empty, open or not finite, or the peg is not convex and has no convex pieces.
     """
 
     __caches__: tuple[str, ...] = ("_grid", "_elsewhere")  # of the part

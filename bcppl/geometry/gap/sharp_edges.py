@@ -12,7 +12,9 @@ from bcppl.geometry.bounding_spheres import bounding_sphere, compact_groups
 from bcppl.geometry.parts import Part
 
 _LONGEST = 0.008  # m; longer edges are subdivided
-_SHARP = np.radians(5.0)  # smallest dihedral angle
+# Smallest dihedral angle, rad. A flat side of a peg touches a finely meshed fillet or dome at its edges
+# alone, however shallow these are. Below lie diagonals of flat faces, and the rounding of coordinates.
+_SHARP = 1e-3
 CANCELLED = 0.1  # length of a sum of unit normals below which they are opposite
 
 

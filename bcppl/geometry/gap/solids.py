@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bcppl.arrays import Array, Indices
+from bcppl.errors import InputError
 from bcppl.geometry.bounding_spheres import bounding_sphere, compact_groups
 from bcppl.geometry.convex.hausdorff import planes_of, solid_of
 from bcppl.geometry.parts import Part
@@ -29,8 +30,19 @@ class Solids(NamedTuple):
 
 
 def solids_of(peg: Part) -> Solids:
-    """Of a peg: its convex pieces, or its hull where its mesh is convex or has none."""
-    meshes = [peg.mesh.convex_hull] if peg.mesh.is_convex or not peg.pieces else map(solid_of, peg.pieces)
+    """Of a peg: its hull where its mesh is convex, else its convex pieces.
+
+    Raises:
+        InputError: its mesh is not convex and it has no pieces; its hull would fill grooves and notches.
+    """
+    if not peg.mesh.is_convex and not peg.pieces:
+        raise InputError(
+            f"part {peg.name!r} has no convex pieces and its mesh is not convex, so the gap of this peg "
+            "cannot be measured; give it convex pieces with `bcppl.geometry.extrusion.extruded` (from its "
+            "outline), `bcppl.geometry.layers.prismatic` (upright walls) or "
+            "`bcppl.geometry.convex.decomposition.decomposed` (any mesh)."
+        )
+    meshes = [peg.mesh.convex_hull] if peg.mesh.is_convex else map(solid_of, peg.pieces)
     planes = [np.unique(np.round(planes_of(mesh), 9), axis=0) for mesh in meshes]
     corners = np.unique(np.round(peg.vertices, 9), axis=0)
     groups = compact_groups(corners)

@@ -94,6 +94,8 @@ class TouchSettings:
                 f"bench = {self.bench!r} holds what is no error of a bench; give some such as "
                 "`bcppl.distributions.episodes.Grasp()`, or a profile."
             )
+        if self.bench is not None:
+            object.__setattr__(self, "bench", LinearErrors(self.bench).errors)
 
 
 MakesGap = Callable[[Part, Part], PegGap]
