@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from bcppl.recordings import load, problems
 from bcppl.recordings.importers import Imported, bag, bench
 from bcppl.recordings.importers.bag.bag_log import BagLog
 from bcppl.recordings.importers.bag.reading import Bag
+from bcppl.recordings.importers.bench.configuration.drafts import spelled
 from bcppl.recordings.importers.bench.configuration.reading import read_configuration
 from bcppl.recordings.importers.bench.pose_columns import read_joints
 from bcppl.robot.kinematics import Robot
@@ -317,6 +319,50 @@ def test_no_definition_of_a_bag_is_compiled(tmp_path: Path, monkeypatch: pytest.
     with Bag(path) as opened, pytest.raises(InputError, match="of another definition"):
         opened.topic("pose", "/pose", ["geometry_msgs/msg/PoseStamped"])
     assert registered == ["tf2_msgs/msg/TFMessage"]
+
+
+def test_a_name_in_a_bag_is_no_line_of_the_drafted_configuration(tmp_path: Path) -> None:
+    frame = "base\nsource: 'injected'\n#"
+
+    def rows(types: bag_logs.Types) -> Iterator[bag_logs.Row]:
+        zero = types("geometry_msgs/Vector3", 0.0, 0.0, 0.0)
+        for stamp in (0.0, 0.1):
+            wrench = types("geometry_msgs/Wrench", zero, zero)
+            stamped = types("geometry_msgs/WrenchStamped", types.header(stamp, frame), wrench)
+            yield stamp, "/wrench", "geometry_msgs/WrenchStamped", stamped
+
+    path, new = bag_logs.write(tmp_path / "bag", "mcap", rows), tmp_path / "new.yaml"
+    with pytest.raises(typer.Exit):
+        bag.command(path, write=new)
+    text = new.read_text()
+    assert "source" not in yaml.safe_load(text)
+    assert r'in the frame "base\nsource' in text
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "/wrench",
+        "side 1",
+        "a: b",
+        "x\ny",
+        "2025-31-01",
+        "1.5",
+        "",
+        "~",
+        "it's",
+        "é",
+        "\u202ex",
+        "a,b]",
+        "&a",
+        "'",
+    ],
+)
+def test_a_name_is_spelled_so_that_yaml_reads_it(name: str) -> None:
+    text = spelled(name)
+    assert text.isprintable() and (text == name or not re.fullmatch("[a-z/_]+", name))
+    assert yaml.safe_load(f"{{topic: {text}, every: 2}}  # a guess, {text}") == {"topic": name, "every": 2}
+    assert yaml.safe_load(f"camera:\n  {text}:  # a guess\n    1") == {"camera": {name: 1}}
 
 
 def test_without_a_configuration_one_is_drafted(

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import io
+import struct
 import sys
+import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import yaml
+from PIL import EpsImagePlugin, Image
 
 from bcppl.errors import InputError
+from bcppl.recordings.importers.bench.configuration.fields import BenchFields
 from bcppl.recordings.importers.bench.configuration.reading import read_configuration
 from bcppl.recordings.importers.bench.depth_images import read_depth
 from bcppl.recordings.importers.bench.pose_columns import stated_pose
@@ -69,6 +75,20 @@ WRONG = {
     "is no valid YAML": "a: [1, 2",
     "the field 'a' stands there twice": "a: 1\na: 2\n",
     "could not determine a constructor": "a: !!python/object/apply:os.system ['false']\n",
+    "the alias 'a' has to be written out in line 2": "a: &a [x, x]\nb: &b [*a, *a]\nsource: [*b, *b]\n",
+    "'2025-31-01' is no timestamp, and text needs quotes, in line 2": "model: m\nsource: 2025-31-01\n",
+    "'foo' is no int, .* in line 1": "source: !!int foo\n",
+    "'foo' is no bool": "source: !!bool foo\n",
+    "'foo' is no timestamp": "source: !!timestamp foo\n",
+    r"'9+... \(5002 characters\) is no int": f"source: {'9' * 5000}\n",
+    r"'1:1:[:1]+... \(603 characters\) is no float": f"source: {'1:' * 299}1.0\n",
+    r"wrench.columns is 'x+... \(50002 characters\); give a list": changed(
+        "wrench", "columns", value=50000 * "x"
+    ),
+    r"wrench.axes is \['x', .* characters\); give 'sensor'": changed("wrench", "axes", value=["x"] * 999),
+    "has no field 'x+…'; its fields": changed("x" * 5000, value=1),
+    "could not determine a constructor for the tag .*x+… in line 1": f"a: !!python/{5000 * 'x'} 1\n",
+    r"cameras.a b.x1b is 3": changed("cameras", "a\nb\x1b", value=3),
 }
 
 
@@ -80,8 +100,8 @@ def test_each_mistake_is_one_sentence(words: str, tmp_path: Path) -> None:
     path.write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match=words) as failure:
         read_configuration(path)
-    assert_one_sentence(str(failure.value))
-    assert "bench.yaml" in str(failure.value)
+    assert_one_sentence(str(failure.value).replace("... (", " ("))
+    assert "bench.yaml" in str(failure.value) and len(str(failure.value)) < 400
 
 
 def test_the_template_is_a_configuration(tmp_path: Path) -> None:
@@ -166,6 +186,8 @@ def test_parquet_files_are_read_where_pyarrow_is_installed(
         ("a.csv", "t\n0\n", ["t"], "holds 1 rows"),
         ("a.xlsx", "", ["t"], r"ends in '\.xlsx'"),
         ("a.npy", "no array", ["t"], "holds no plain numbers"),
+        ("a.npz", "no array", ["t"], "holds no plain numbers"),
+        ("a.csv", f"t,{200000 * 'x'}\n0,1\n1,2\n", ["t"], "is no table .field larger than .*; export it"),
     ],
 )
 def test_a_wrong_table_is_refused(
@@ -178,12 +200,112 @@ def test_a_wrong_table_is_refused(
 
 
 def test_pickled_objects_are_not_read(tmp_path: Path) -> None:
-    np.save(tmp_path / "a.npy", np.array([{"a": 1}, None], dtype=object), allow_pickle=True)
-    with pytest.raises(InputError, match="holds no plain numbers"):
-        read_columns(tmp_path / "a.npy", ["a"])
+    objects = np.array([{"a": 1}, None], dtype=object)
+    np.save(tmp_path / "a.npy", objects, allow_pickle=True)
+    np.savez(tmp_path / "a.npz", a=objects)
+    for name in ("a.npy", "a.npz"):
+        with pytest.raises(InputError, match=r"holds no plain numbers \(.*bject.*\); save it again"):
+            read_columns(tmp_path / name, ["a"])
+
+
+def claimed(count: int) -> bytes:
+    """The header of an .npy file of so many rows of one number."""
+    file = io.BytesIO()
+    np.lib.format.write_array_header_1_0(file, {"descr": "<f8", "fortran_order": False, "shape": (count, 1)})
+    return file.getvalue()
+
+
+def zipped(path: Path, *members: bytes, **options: Any) -> None:
+    with zipfile.ZipFile(path, "w", **options) as file:
+        for member in members:
+            file.writestr("a.npy", member)
+
+
+@pytest.mark.filterwarnings("ignore:Duplicate name")
+@pytest.mark.parametrize(
+    "kind", ["claim", "claim in a zip", "bomb", "twice", "cut off", "changed", "renamed"]
+)
+def test_a_damaged_file_of_arrays_is_refused(kind: str, tmp_path: Path) -> None:
+    path, whole, words = tmp_path / "a.npz", claimed(4) + ROWS[:, 0].tobytes(), "holds no plain numbers"
+    zipped(path, whole)
+    if kind == "claim":
+        path = tmp_path / "a.npy"
+        path.write_bytes(claimed(10**13) + bytes(99))
+        words = "mmap length is greater than file size"  # and no memory is asked for
+    elif kind == "claim in a zip":
+        zipped(path, claimed(10**13) + bytes(99))
+    elif kind == "bomb":
+        zipped(path, claimed(9 << 20) + bytes(72 << 20), compression=zipfile.ZIP_DEFLATED, compresslevel=1)
+        words = "claims more numbers than its size explains"
+    elif kind == "twice":
+        zipped(path, whole, whole)
+        words = "a name is given twice"
+    elif kind == "cut off":
+        path.write_bytes(path.read_bytes()[:-30])
+    elif kind == "changed":
+        content = bytearray(path.read_bytes())
+        content[content.index(ROWS[3:, 0].tobytes())] ^= 1
+        path.write_bytes(content)
+        words = "Bad CRC-32"
+    else:
+        path = path.rename(tmp_path / "a.npy")
+    with pytest.raises(InputError, match=words) as failure:
+        read_columns(path, ["a[0]"])
+    assert_one_sentence(str(failure.value).replace(str(path), "it"))
+    if path.suffix == ".npy":
+        with pytest.raises(InputError, match=r"holds no plain numbers \(.*\); save it again"):
+            read_depth(path, CAMERA)
 
 
 # ---- images
+
+CAMERA = BenchFields.model_validate(yaml.safe_load(TEMPLATE)).cameras["wrist"]
+
+
+def png(width: int, height: int) -> bytes:
+    """A PNG of 16 bits whose pixels are missing."""
+
+    def chunk(name: bytes, content: bytes) -> bytes:
+        check = struct.pack(">I", zlib.crc32(name + content))
+        return struct.pack(">I", len(content)) + name + content + check
+
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 16, 0, 0, 0, 0))
+    return b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", zlib.compress(b"")) + chunk(b"IEND", b"")
+
+
+def test_a_depth_image_is_read_by_its_own_formats_reader_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Data never runs code: Pillow gives PostScript to Ghostscript."""
+    ran: list[Any] = []
+    monkeypatch.setattr(EpsImagePlugin, "Ghostscript", lambda *given, **more: ran.append(given))
+    files = {
+        "cannot identify": b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 2 2\n%%EndComments\n",
+        "exceeds limit of": png(40000, 40000),
+        "claims 4000 x 4000 pixels in 65 bytes": png(4000, 4000),
+        "truncated": png(2, 2),
+    }
+    for words, content in files.items():
+        (tmp_path / "view_0.png").write_bytes(content)
+        with pytest.raises(InputError, match=rf"is no image \(.*{words}.*\); export the depth") as failure:
+            read_depth(tmp_path / "view_0.png", CAMERA)
+        assert_one_sentence(str(failure.value).replace(str(tmp_path), ""))
+    assert not ran
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"), [("a.png", "u2"), ("a.tif", "u2"), ("a.tiff", "i4"), ("a.TIF", "f4"), ("a.tif", ">u2")]
+)
+def test_depth_images_of_integers_and_floats(name: str, kind: str, tmp_path: Path) -> None:
+    Image.fromarray(np.full((2, 3), 700, kind)).save(tmp_path / name)
+    np.testing.assert_allclose(read_depth(tmp_path / name, CAMERA), np.full((2, 3), 0.7), atol=1e-7)
+
+
+def test_a_depth_image_of_8_bits_is_refused(tmp_path: Path) -> None:
+    for shape in ((2, 3), (2, 3, 3)):
+        Image.fromarray(np.full(shape, 70, np.uint8)).save(tmp_path / "a.png")
+        with pytest.raises(InputError, match="has 8 bits, too few for a depth"):
+            read_depth(tmp_path / "a.png", CAMERA)
 
 
 def test_depth_images_of_other_kinds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -209,6 +209,12 @@ def test_commands_write_the_configuration_and_import_it(written: tuple[Path, Any
     done = CliRunner().invoke(app, ["import", "bench", str(path), "-o", str(out)], catch_exceptions=False)
     assert done.exit_code == 0 and "common stamps: 5996 at 500 Hz" in done.output
     assert problems(load(out)) == []
+    over = CliRunner().invoke(app, ["import", "bench", str(path), "-o", str(path)]).exception
+    assert (
+        isinstance(over, InputError)
+        and "would overwrite" in str(over)
+        and path.read_text().startswith("part")
+    )
     new = tmp_path / "new.yaml"
     assert CliRunner().invoke(app, ["new", "bench", str(new)], catch_exceptions=False).exit_code == 0
     lines = [line for line in new.read_text().splitlines() if not line.startswith("#")]

@@ -17,6 +17,7 @@ import pytest
 
 from bcppl.geometry.camera import Camera
 from bcppl.recordings import DepthImage, Measurement, Recording, View, problems, save
+from bcppl.sensors.push import PushSensor
 from tests.command_line import SHIPPED, Ran, short
 
 DATA = Path(__file__).parents[2] / "shared/data"
@@ -119,6 +120,51 @@ def test_check_lists_all_problems(bcppl: Callable[..., Ran], tmp_path: Path) -> 
     listed = json.loads(bcppl("check", "bad.h5", "--json").out)
     assert len(listed["problems"]) == 3 and "point finger" not in listed["description"]
     assert bcppl("check", SHIPPED).code == 0
+
+
+# Large enough to be looked at for doubts.
+LARGE = Measurement(
+    View(Camera("large", 80, 60, 90.0, 90.0, 40.0, 30.0, np.array([0.03, 0.03, 0.5, 0, 1, 0, 0]))),
+    DepthImage(np.full((60, 80), 0.45)),
+)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("measurements/000000/observation/times", np.arange(20.0)[:, None], "has times of shape (20, 1)"),
+        ("guess/translation", np.array(0.02), "the guess's translation is not three finite half widths"),
+        ("guess/world_from_part", np.eye(7)[3:4], "the guess (world_from_part) has shape (1, 7)"),
+        ("truth/world_from_part", np.eye(7)[3:4], "the truth (world_from_part) has shape (1, 7)"),
+    ],
+)
+def test_check_lists_an_odd_shape_as_what_is_wrong(
+    name: str, value: Any, message: str, bcppl: Callable[..., Ran], tmp_path: Path
+) -> None:
+    save(replace(short(), measurements=[*short().measurements, LARGE]), tmp_path / "bad.h5")
+    with h5py.File(tmp_path / "bad.h5", "a") as file:
+        units = file[name].attrs["units"]
+        del file[name], file.attrs["sha256"]
+        file.create_dataset(name, data=value).attrs["units"] = units
+    ran = bcppl("check", "bad.h5")
+    assert ran.code == 2 and "Traceback" not in ran.err + ran.out, ran
+    assert "wrong:" in ran.out and message in " ".join(ran.out.split())
+    assert "3 pushes" in ran.out  # the description, where it can be made
+
+
+def test_check_lists_problems_where_nothing_can_be_described(
+    bcppl: Callable[..., Ran], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As with a kind of measurement whose package describes what has no problem alone."""
+
+    def fails(*given: Any) -> Any:
+        raise TypeError
+
+    monkeypatch.setattr(PushSensor, "describe", fails)
+    save(replace(short(), truth=np.full(7, np.nan)), tmp_path / "bad.h5")
+    ran = bcppl("check", "bad.h5", "--json")
+    assert ran.code == 2 and len(json.loads(ran.out)["problems"]) == 1
+    assert bcppl("check", SHIPPED).code == 1  # a mistake of the package is one
 
 
 def newer(path: Path) -> None:

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 import os
 import random
+import re
+import struct
 import subprocess
 import sys
 import time
@@ -136,6 +139,41 @@ def test_numbers_that_compress_too_well_are_written_as_they_are(tmp_path: Path) 
     assert isinstance(image, DepthImage) and (image.depth == 0.5).all()
 
 
+LONG, SHORT = 1_000_001, 333  # characters of words
+
+
+@pytest.mark.parametrize("kind", ["dataset", "attribute", "attributes"])
+@pytest.mark.parametrize("sealed", [False, True])
+def test_a_word_that_many_refer_to_is_counted_each_time(kind: str, sealed: bool, tmp_path: Path) -> None:
+    """A file of a megabyte, with a right checksum too, would take hundreds."""
+    path = tmp_path / "actions.h5"
+    _save_plans(path)
+    path.write_bytes(path.read_bytes()[: -hdf5.LENGTH])
+    words, text = ["x" * LONG, *200 * [SHORT * "y"]], h5py.string_dtype()
+    with h5py.File(path, "r+") as file:
+        if kind == "dataset":
+            del file["actions/000000/manners"]
+            file["actions/000000"].create_dataset("manners", data=words, dtype=text)
+        elif kind == "attribute":
+            file.attrs.create("words", words, dtype=text)
+        else:
+            for k, word in enumerate(words):
+                file.attrs.create(f"word {k}", word, dtype=text)
+    content = bytearray(path.read_bytes())
+    # A reference is the word's length, an address, which is not zero, and a number.
+    (long,), short = (
+        [match.start() for match in re.finditer(struct.pack("<I", length) + rb"(?!\0{4})", content)]
+        for length in (LONG, SHORT)
+    )
+    assert len(short) == 200
+    for place in short:
+        content[place : place + 16] = content[long : long + 16]
+    seal = hdf5.MARK + hashlib.sha256(content).hexdigest().encode() + b"\n"
+    path.write_bytes(content + (seal if sealed else b""))
+    assert len(content) < 1.2 * LONG
+    assert re.search("claims? more (numbers )?than a file of", refusal(load_actions, path))
+
+
 # ---- what is refused, by name
 
 
@@ -168,6 +206,9 @@ def test_what_a_recording_does_not_hold_is_named(tmp_path: Path) -> None:
     assert "linked twice" in loop
     other = edited(tmp_path, lambda file: file.__setitem__("peg2", h5py.ExternalLink("x.h5", "/")))
     assert "link to another place" in other
+    text: Any = {"data": ["a"], "dtype": h5py.string_dtype(), "chunks": (1,)}
+    chunks = edited(tmp_path, lambda file: file.create_dataset("part/words", **text))
+    assert "is text in chunks; write it without them" in chunks
 
 
 def test_a_mesh_is_one_file_of_a_known_format(tmp_path: Path) -> None:

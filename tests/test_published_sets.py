@@ -300,6 +300,19 @@ def test_an_fmb_trajectory_is_listed_and_a_configuration_drafted(tmp_path: Path)
     assert fields.cut.spans == [[2.0, 4.9]] and fields.cameras["wrist_1"].topic == "obs/wrist_1_depth"
 
 
+def test_a_name_of_an_array_is_no_line_of_the_drafted_configuration(tmp_path: Path) -> None:
+    name = "obs/side 1: x\nsource: 'injected'\n#\x1b_depth"
+    path, _ = write_fmb(tmp_path, **{name: trajectory()["obs/wrist_1_depth"]})
+    named = path.rename(tmp_path / "a\nsource: 'injected'\n#.npz")
+    new = tmp_path / "new.yaml"
+    with pytest.raises(typer.Exit):
+        fmb.command(named, write=new)
+    fields = read_configuration(new)
+    assert fields.source == ""
+    assert sorted(camera.topic for camera in fields.cameras.values()) == [name, "obs/wrist_1_depth"]
+    assert new.read_text().replace("\n", "").isprintable()
+
+
 def test_the_line_of_the_docs_converts_a_pickled_trajectory(tmp_path: Path) -> None:
     page = (Path(__file__).parents[1] / "docs/import_bench.md").read_text(encoding="utf-8")
     (line,) = re.findall(r'^python -c "(.*)" trajectory\.npy trajectory\.npz$', page, re.MULTILINE)

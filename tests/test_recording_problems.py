@@ -1,7 +1,9 @@
 """Recordings that are wrong: each problem is one sentence that names the place."""
 
 import dataclasses
+import math
 import re
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -15,6 +17,7 @@ from bcppl.recordings import (
     Recording,
     View,
     describe,
+    notes,
     problems,
     validate,
 )
@@ -223,6 +226,69 @@ def test_each_problem_is_one_sentence_that_names_the_place(case: str) -> None:
         validate(recording)
     assert str(failure.value) == found[0]
     assert describe(recording)
+
+
+ODD_SHAPES = [(), (0,), (2,), (1, 7), (2, 3, 4)]
+
+
+def odd(thing: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+    """All that a thing could be with one array of another shape, or one number out of all bounds."""
+    if dataclasses.is_dataclass(thing):
+        for field in dataclasses.fields(thing):
+            for where, value in odd(getattr(thing, field.name), f"{name}.{field.name}"):
+                yield where, replace(thing, **{field.name: value})  # type: ignore[type-var]
+    elif isinstance(thing, np.ndarray):
+        ones: list[Any] = [np.ones(shape, thing.dtype) for shape in ODD_SHAPES]
+        for value in [*ones, thing[None], thing[:, None] if thing.ndim else thing, thing[:0]]:
+            yield f"{name} {value.shape}", value
+        for fill in (np.nan, 1e308, 0.0) if thing.dtype.kind == "f" else ():
+            yield f"{name} {fill}", np.full_like(thing, fill)
+    elif isinstance(thing, int | float):
+        for number in (
+            (0, -1, 10**9, math.nan, math.inf, 5e-324) if isinstance(thing, float) else (0, -1, 10**9)
+        ):
+            yield f"{name} {number}", type(thing)(number)
+    elif isinstance(thing, list | tuple):
+        for k, each in enumerate(thing):
+            for where, value in odd(each, f"{name}[{k}]"):
+                yield where, type(thing)([*thing[:k], value, *thing[k + 1 :]])
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_whatever_a_file_holds_is_a_list_of_sentences() -> None:
+    """Files hold arrays of any shape: what cannot be read by the rest of the checks is named by the first."""
+    whole = full()
+    hand = replace(camera("hand"), distortion=(0.01, 0.0, 0.0, 0.0), wrist_from_camera=np.eye(7)[3])
+    seen = Measurement(View(hand), whole.measurements[0].observation)
+    whole = replace(whole, measurements=[*whole.measurements[1:4], seen])
+    assert problems(whole) == []
+    for where, recording in odd(whole):
+        try:
+            found = problems(recording)
+            assert dict(describe(recording))["model"]
+            notes(recording)
+        except Exception as error:
+            raise AssertionError(f"{where} is not reported: {error!r}") from error
+        for problem in found:
+            assert_one_sentence(problem)
+        shape = re.search(r"(truth|guess\.world_from_part|world_from_camera) (\(.*\))$", where)
+        assert not shape or shape[2] == "(7,)" or any(shape[2] in each for each in found), (where, found)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "pattern"),
+    [
+        ("translation", 0.02, "translation is not three finite half widths"),
+        ("tilt", np.full(2, 0.1), "the guess's tilt is of type ndarray; give one number, in radians"),
+        ("tilt", None, "the guess's tilt is None; give one number, in radians"),
+        ("yaw", "0.1", "the guess's yaw is of type str; give one number, in radians"),
+    ],
+)
+def test_a_guess_of_other_shapes_is_one_sentence(name: str, value: Any, pattern: str) -> None:
+    guess = replace(full().guess, angle=None, **{name: value})
+    found = problems(replace(full(), guess=guess))
+    assert len(found) == 1 and re.search(pattern, found[0]), found
+    assert_one_sentence(found[0])
 
 
 @pytest.mark.parametrize(

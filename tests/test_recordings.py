@@ -1,6 +1,7 @@
 """Recordings on disk: what comes back is what went in, and a refusal is one sentence."""
 
 import dataclasses
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -161,6 +162,36 @@ def test_a_failed_save_leaves_what_was_there(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["a.h5"] and path.read_bytes() == before
     with pytest.raises(InputError, match="no folder"):
         save(full(), tmp_path / "missing" / "a.h5")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no pipes in folders")
+def test_what_is_no_file_is_not_replaced_by_one(tmp_path: Path) -> None:
+    """As root, a device would be gone for all programs."""
+    os.mkfifo(tmp_path / "pipe.h5")
+    (tmp_path / "link.h5").symlink_to("pipe.h5")
+    (tmp_path / "folder.h5").mkdir()
+    before = sorted(tmp_path.iterdir())
+    for path in before:
+        with pytest.raises(
+            InputError, match=rf"{path.name} cannot be written: .* give a file's name"
+        ) as failure:
+            save(full(), path)
+        assert_one_sentence(str(failure.value).replace(str(path), "it"))
+    assert sorted(tmp_path.iterdir()) == before
+    assert (tmp_path / "pipe.h5").is_fifo() and (tmp_path / "link.h5").is_symlink()
+
+
+def test_a_link_stays_and_its_file_is_replaced(tmp_path: Path) -> None:
+    (tmp_path / "there").mkdir()
+    (tmp_path / "link.h5").symlink_to("there/a.h5")
+    for seed in (0, 1):  # at first the file is yet to be made
+        save(full(seed), tmp_path / "link.h5")
+        assert (tmp_path / "link.h5").is_symlink() and not (tmp_path / "there/a.h5").is_symlink()
+        assert_identical(load(tmp_path / "there/a.h5"), full(seed))
+    assert sorted(each.name for each in tmp_path.rglob("*")) == ["a.h5", "link.h5", "there"]
+    (tmp_path / "lost.h5").symlink_to("nowhere/a.h5")
+    with pytest.raises(InputError, match=r"no folder .*nowhere; make it first"):
+        save(full(), tmp_path / "lost.h5")
 
 
 def test_a_truncated_file_is_refused_at_any_length(tmp_path: Path) -> None:

@@ -143,6 +143,15 @@ def test_problems_of_a_new_kind_stand_where_its_measurements_do(laser: Any) -> N
     ]
 
 
+@pytest.mark.parametrize("far", [np.inf, np.nan, 0.0, -1.0, 0.05])
+def test_a_laser_without_a_range_is_a_problem(laser: Any, far: float) -> None:
+    """Its outliers are spread over the range, so a likelihood without one is no density."""
+    (found,) = problems(shone(laser, 0.2, far=far))
+    assert found.startswith("measurement 7: laser 'wrist' reaches from 0.05 to ") and "below far" in found
+    assert_one_sentence(found)
+    assert len(problems(shone(laser, 0.2, near=-0.1))) == 1
+
+
 def test_a_new_kind_is_described_and_counted(laser: Any) -> None:
     rows = dict(describe(shone(laser, 0.2, 0.3)))
     assert rows["measurements"] == "3 views, 3 probe windows, 1 push, 2 laser distances"

@@ -136,10 +136,12 @@ def _guess(guess: Guess) -> Iterator[str]:
     elif (widths > LARGEST_EXTENT).any():
         yield f"the guess is {widths.max():.4g} m wide, probably in millimetres; scale it by 0.001 to metres."
     for name in ("tilt", "yaw", "angle"):
-        limit = getattr(guess, name)
-        if limit is None:
+        limit: Any = getattr(guess, name)
+        if limit is None and name == "angle":
             continue
-        if not math.isfinite(limit) or limit < 0:
+        if not hasattr(limit, "__float__") or np.ndim(limit) != 0:
+            yield f"the guess's {name} is {_kind(limit)}; give one number, in radians."
+        elif not math.isfinite(limit) or limit < 0:
             yield f"the guess's {name} is {limit:.4g}; give a limit of at least 0, in radians."
         elif limit > math.pi + 1e-9:
             yield f"the guess's {name} is {limit:.4g} rad, probably degrees; give radians below pi."

@@ -35,16 +35,23 @@ _read_before: set[tuple[str, ...]] = set()  # checksums of files that were read,
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """A new file beside `path`, which is moved there once it is written, and removed if that fails.
 
+    Where `path` is a link, it stays one, and the file that it leads to is replaced.
+
     Raises:
-        InputError: the folder is missing, or what is written raises an error of the system, type or value.
+        InputError: the folder is missing, something else than a file is there, or what is written raises an
+            error of the system, type or value.
     """
     path = Path(path)
-    if not path.parent.is_dir():
-        raise InputError(f"{path} cannot be written: there is no folder {path.parent}; make it first.")
-    beside = path.with_name(f".{path.name}.{os.getpid()}.part")
+    place = Path(os.path.realpath(path)) if os.path.islink(path) else path
+    if not place.parent.is_dir():
+        raise InputError(f"{path} cannot be written: there is no folder {place.parent}; make it first.")
+    if os.path.exists(path) and not os.path.isfile(path):
+        # To replace a device or a pipe would take it from all who use it.
+        raise InputError(f"{path} cannot be written: it is a folder, device or pipe; give a file's name.")
+    beside = place.with_name(f".{place.name}.{os.getpid()}.part")
     try:
         yield beside
-        os.replace(beside, path)
+        os.replace(beside, place)
     except InputError:
         raise
     except OSError as error:

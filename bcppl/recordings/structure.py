@@ -17,9 +17,11 @@ from collections.abc import Sequence
 from typing import Any
 
 import h5py
+import numpy as np
 
 ALLOWANCE = 64 << 20  # bytes of numbers in any file, however small
 RATIO = 10  # bytes of numbers for each byte of a file beyond that: depth and wrenches compress less
+WORD = 64  # bytes of an object of Python without its characters, rounded up
 SECONDS = 4.0  # of one core for a small file
 BYTES_A_SECOND = 20 << 20  # of a large one, compressed
 FILTERS = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32}  # others are plugins
@@ -52,7 +54,7 @@ def check(file: h5py.File, size: int, read: bool = False, within: Sequence[str] 
     left, seen, waiting = limit(size), {_address(file.id)}, [("", h5py.h5g.open(file.id, b"/"))]
     while waiting:
         above, group = waiting.pop()
-        left -= _attributes(group, above or "/", read)
+        left -= _attributes(group, above or "/", left, size, read, within)
         for key in group:
             where = f"{above}/{key.decode(errors='replace')}"
             if within and not any(_leads(where, each) for each in within):
@@ -67,7 +69,8 @@ def check(file: h5py.File, size: int, read: bool = False, within: Sequence[str] 
             if isinstance(node, h5py.h5g.GroupID):
                 waiting.append((where, node))
             elif isinstance(node, h5py.h5d.DatasetID):
-                left -= _attributes(node, where, read) + _dataset(node, where, left)
+                left -= _attributes(node, where, left, size, read, within)
+                left -= _dataset(node, where, left, size)
                 if left < 0:
                     raise StructureError(f"{where} claims more numbers than a file of {size} bytes explains")
                 if read:
@@ -87,7 +90,7 @@ def _address(node: Any) -> tuple[int, int]:
     return found.fileno, found.addr
 
 
-def _attributes(node: Any, where: str, read: bool) -> int:
+def _attributes(node: Any, where: str, left: int, size: int, read: bool, within: Sequence[str]) -> int:
     """The bytes of an object's attributes."""
     total = 0
     for index in range(h5py.h5a.get_num_attrs(node)):
@@ -95,14 +98,22 @@ def _attributes(node: Any, where: str, read: bool) -> int:
         if kept.get_space().get_simple_extent_type() == h5py.h5s.NULL or not _plain(kept.dtype):
             raise StructureError(f"attribute {kept.name!r} of {where} is neither numbers nor text")
         total += kept.get_storage_size()
+        holder = h5py.Group(node) if isinstance(node, h5py.h5g.GroupID) else h5py.Dataset(node)
+        if _refers(kept.dtype) and kept.shape == ():
+            total += len(holder.attrs[kept.name.decode()])
+        elif _refers(kept.dtype) and not within:
+            # HDF5 reads all of an attribute at once. No file of bcppl has such a one, and in files of other
+            # programs it is read by the process with limits alone.
+            total += math.prod(kept.shape) * size
+        if total > left:
+            raise StructureError(f"attributes of {where} claim more than a file of {size} bytes explains")
         if read:
-            holder = h5py.Group(node) if isinstance(node, h5py.h5g.GroupID) else h5py.Dataset(node)
             holder.attrs[kept.name.decode()]
     return total
 
 
-def _dataset(node: Any, where: str, left: int) -> int:
-    """The bytes that a dataset's numbers take in memory."""
+def _dataset(node: Any, where: str, left: int, size: int) -> int:
+    """The bytes that a dataset's numbers or text take in memory."""
     plan, dtype = node.get_create_plist(), node.dtype
     if node.get_space().get_simple_extent_type() == h5py.h5s.NULL or not _plain(dtype):
         raise StructureError(f"{where} holds neither numbers nor text")
@@ -113,11 +124,42 @@ def _dataset(node: Any, where: str, left: int) -> int:
         raise StructureError(f"{where} is compressed by a plugin; write it with gzip")
     if layout == h5py.h5d.CHUNKED and (chunk := math.prod(plan.get_chunk()) * dtype.itemsize) > left:
         raise StructureError(f"{where} lies in chunks of {chunk} bytes, more than the file explains")
-    return math.prod(node.shape) * dtype.itemsize
+    if not _refers(dtype):
+        return math.prod(node.shape) * dtype.itemsize
+    if layout == h5py.h5d.CHUNKED:  # which are read whole for each word that is looked at
+        raise StructureError(f"{where} is text in chunks; write it without them")
+    return _text(node, left, size)
+
+
+def _text(node: Any, left: int, size: int) -> int:
+    """The bytes of words of any length, counted until they are too many.
+
+    Each is a reference, and a thousand may be to one word of a megabyte: so few are read at a time that they
+    could all be as long as the file.
+    """
+    count = math.prod(node.shape)
+    total = count * WORD
+    step = max(1, limit(size) // (2 * size))
+    for begin in range(0, count, step):
+        if total > left:
+            break
+        space, chosen = node.get_space(), np.arange(begin, min(begin + step, count))
+        if node.shape:
+            space.select_elements(np.stack(np.unravel_index(chosen, node.shape), axis=1))
+        words = np.empty(len(chosen), dtype=node.dtype)
+        node.read(h5py.h5s.create_simple(words.shape), space, words)
+        total += sum(map(len, words))
+    return total
 
 
 def _plain(dtype: Any) -> bool:
     return (dtype.kind in NUMERIC and dtype.shape == ()) or h5py.check_string_dtype(dtype) is not None
+
+
+def _refers(dtype: Any) -> bool:
+    """Whether values are text of any length, which lies elsewhere in the file."""
+    held = h5py.check_string_dtype(dtype)
+    return held is not None and held.length is None
 
 
 def _limited(size: int) -> None:

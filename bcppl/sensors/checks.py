@@ -34,7 +34,9 @@ def pose(what: str, values: object) -> Iterator[str]:
     except (TypeError, ValueError):
         yield f"{what} is of type {type(values).__name__}; a pose is seven numbers {POSE_NUMBERS}."
         return
-    if problem := pose_problem(what, numbers):
+    if numbers.shape != (7,):  # a pose in a list of one is none: what is read after the checks adds numbers
+        yield f"{what} has shape {numbers.shape}; a pose is seven numbers {POSE_NUMBERS}."
+    elif problem := pose_problem(what, numbers):
         yield problem
 
 
@@ -65,7 +67,7 @@ def readings(what: str, values: Array) -> Iterator[str]:
 
 def rows(what: str, values: Array, at: Array, columns: str, remedy: str = LEAVE_OUT) -> Iterator[str]:
     """Problems of rows of numbers, one row for each time; `columns` names their columns, one word each."""
-    if np.shape(values) != (*np.shape(at), len(columns.split())):
+    if np.ndim(at) != 1 or np.shape(values) != (*np.shape(at), len(columns.split())):
         yield f"{what} has shape {np.shape(values)} for {np.shape(at)} times; give {columns} for each time."
     elif not (finite := np.isfinite(values).all(axis=1)).all():
         yield f"{what} has a number that is not finite at row {first(~finite)}; {remedy}."

@@ -100,7 +100,7 @@ class DepthSensor(PlannedAsIs):
             where, camera, image = f"measurement {index}", measurement.action.camera, measurement.observation
             wrong: list[str] = []
             if camera.name not in cameras:
-                wrong += _camera(f"{where}: camera {camera.name!r}", camera, recording)
+                wrong += _camera(f"{where}: camera {camera.name!r}", camera, image, recording)
                 wrong += _background(camera, recording)
             wrong += checks.named_alike(where, "camera", camera, cameras)
             wrong += _depth(where, image.depth, camera)
@@ -219,7 +219,7 @@ def _depth(where: str, depth: Array, camera: Camera) -> Iterator[str]:
         )
 
 
-def _camera(what: str, camera: Camera, recording: Recording) -> Iterator[str]:
+def _camera(what: str, camera: Camera, image: DepthImage, recording: Recording) -> Iterator[str]:
     if camera.width < 1 or camera.height < 1 or not (camera.fx > 0 and camera.fy > 0):
         yield f"{what} has no pixels or no focal length; give its width, height, fx and fy in pixels."
     elif not np.isfinite([camera.fx, camera.fy, camera.cx, camera.cy]).all():
@@ -230,12 +230,16 @@ def _camera(what: str, camera: Camera, recording: Recording) -> Iterator[str]:
             f"{camera.width} x {camera.height}, a view of nearly half the world; give them in pixels, not in "
             "millimetres."
         )
-    elif camera.distortion:
+    elif camera.distortion and image.depth.shape == (camera.height, camera.width):
+        # The rays of an image that is not there could take terabytes.
         try:
             coefficients(tuple(camera.distortion))
             camera.rays()
         except InputError as error:
             yield f"{what}: {error}"
+        except (ValueError, ArithmeticError) as error:  # numpy's, of numbers that are all but infinite
+            lens = " ".join(f"{k:g}" for k in camera.distortion)
+            yield f"{what} has rays that cannot be computed ({error}); correct its distortion, {lens}."
     if camera.wrist_from_camera is not None:
         yield from checks.pose(f"{what}'s wrist_from_camera", camera.wrist_from_camera)
     if not 0 <= camera.near < camera.far:

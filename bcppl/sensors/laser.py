@@ -109,7 +109,10 @@ class WristLaser(PlannedAsIs):
         for k, (beam, metres) in ((k, (m.action, m.observation.metres)) for k, m in measurements):
             for problem in checks.pose(f"measurement {k}'s world_from_laser", beam.world_from_laser):
                 yield k, problem
-            if not beam.near <= metres <= beam.far:
+            if not 0 <= beam.near < beam.far < math.inf:
+                reach = f"measurement {k}: laser {beam.name!r} reaches from {beam.near:g} to {beam.far:g} m"
+                yield k, f"{reach}; give a finite range, near below far, in metres."
+            elif not beam.near <= metres <= beam.far:
                 yield k, f"measurement {k}: a distance of {metres:.4g} m is out of range; leave it out."
 
     def describe(self, measurements: Sequence[Measurement], recording: Recording) -> list[tuple[str, str]]:

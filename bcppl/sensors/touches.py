@@ -44,13 +44,14 @@ def notes(touches: Sequence[Touch]) -> Iterator[str]:
 
 
 def span(times: Array) -> float:
-    """Seconds from the first time to the last."""
-    return float(times[-1] - times[0]) if times.size else 0.0
+    """Seconds from the first time to the last, whatever the shape of times that have problems."""
+    flat = np.ravel(times)
+    return float(flat[-1] - flat[0]) if flat.size else 0.0
 
 
 def rate(series: Sequence[Array]) -> str:
     """The rate of several series of times, in words: "500 Hz"."""
-    steps = np.concatenate([np.diff(times) for times in series])
+    steps = np.concatenate([np.diff(np.ravel(times)) for times in series])
     middle = float(np.median(steps)) if steps.size else 0.0
     return f"{1 / middle:.0f} Hz" if middle > 0 else "an unknown rate"
 

@@ -14,6 +14,7 @@ from typer.core import TyperGroup
 
 from bcppl.arguments import LARGEST_SEED
 from bcppl.cli.options import AsJson, Recorded
+from bcppl.cli.outputs import refuse_overwriting
 from bcppl.errors import InputError
 from bcppl.visible_text import visible
 
@@ -100,8 +101,7 @@ def _write(recording: Recording, out: Path) -> None:
     from bcppl.recordings import describe, save, validate
 
     validate(recording)
-    if not out.parent.is_dir():
-        raise InputError(f"there is no folder {out.parent} to write {out.name} into; make it first.")
+    refuse_overwriting("--out", out)
     save(recording, out)
     written = f"wrote {out}: {dict(describe(recording))['measurements']}"
     Console().print(visible(written), highlight=False, markup=False)
@@ -146,10 +146,11 @@ def _importing(command: Callable[..., Recording | Imported]) -> Callable[..., No
 
         from bcppl.recordings.importers import Imported
 
+        refuse_overwriting("--out", out, *(each for each in options.values() if isinstance(each, Path)))
         made = command(**options)
         imported = made if isinstance(made, Imported) else Imported(made)
         for line in imported.report:
-            Console().print(line, highlight=False, markup=False, soft_wrap=True)
+            Console().print(visible(line), highlight=False, markup=False, soft_wrap=True)
         _write(imported.recording, out)
 
     wrapped: Any = importing

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import yaml
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -13,7 +12,7 @@ from bcppl.errors import InputError
 from bcppl.recordings.importers.bag import reading
 from bcppl.recordings.importers.bag.images import encoded
 from bcppl.recordings.importers.bag.reading import Bag, Topic
-from bcppl.recordings.importers.bench.configuration.drafts import GUESS, drafted, offer, refuse_place
+from bcppl.recordings.importers.bench.configuration.drafts import GUESS, drafted, offer, refuse_place, spelled
 from bcppl.visible_text import visible
 
 _LOOKED_AT = 200  # messages of a topic that a guess is made from
@@ -45,7 +44,7 @@ def show(path: Path, write: Path | None) -> None:
 
 def configuration(bag: Bag) -> str:
     """The configuration of a bag in YAML: of `bcppl new bench`, with topics for files."""
-    command = f"bcppl import bag {_plain(bag.path.name)} CONFIG"
+    command = f"bcppl import bag {spelled(bag.path.name)} CONFIG"
     return drafted(command, "the bag", _wrench(bag) + _motion(bag), _cameras(bag))
 
 
@@ -64,7 +63,7 @@ def _motion(bag: Bag) -> str:
         return f"pose:\n{_topic(bag, reading.POSE, '/pose')}"
     if reading.TRANSFORMS in kinds:
         parent, child = _frames(bag)
-        words = f"  parent: {_plain(parent)}  {GUESS}\n  child: {_plain(child)}  {GUESS}\n"
+        words = f"  parent: {spelled(parent)}  {GUESS}\n  child: {spelled(child)}  {GUESS}\n"
         return f"pose:\n{_topic(bag, reading.TRANSFORMS, '/tf')}{words}"
     return (
         f"joints:\n{_topic(bag, reading.JOINTS, '/joint_states')}"
@@ -80,10 +79,10 @@ def _cameras(bag: Bag) -> str:
     lines = ["cameras:\n"]
     for k, topic in enumerate(depth):
         info = _nearest(topic.name, [each.name for each in _of(bag, reading.CAMERA)])
-        intrinsics = f"info: {_plain(info)}, " if info else "fx: 320, fy: 320, cx: 159.5, cy: 119.5, "
+        intrinsics = f"info: {spelled(info)}, " if info else "fx: 320, fy: 320, cx: 159.5, cy: 119.5, "
         lines.append(
             f"  camera_{k}:  {GUESS}\n"
-            f"    {{topic: {_plain(topic.name)}, {intrinsics}near: 0.1, far: 2,\n"
+            f"    {{topic: {spelled(topic.name)}, {intrinsics}near: 0.1, far: 2,\n"
             "     frame_from_camera: {xyz: [0.06, 0, 0.04]},   # or world_from_camera, if it stands\n"
             "     every: 2.0}                                  # s; or images: [{time: 1.5}, {time: 4.0}]\n"
         )
@@ -99,10 +98,10 @@ def _topic(bag: Bag, kind: str, example: str) -> str:
     found = sorted((t for t in _of(bag, kind)), key=lambda topic: -topic.count)
     if not found:
         return f"  topic: {example}  # none of {kind.replace('/msg/', '/')} was found\n"
-    others = f"; others: {', '.join(_plain(t.name) for t in found[1:])}" if found[1:] else ""
+    others = f"; others: {', '.join(spelled(t.name) for t in found[1:])}" if found[1:] else ""
     frame = _header_frame(bag, found[0])
-    of = f", in the frame {_plain(frame)}" if frame else ""
-    return f"  topic: {_plain(found[0].name)}  {GUESS}{of}{others}\n"
+    of = f", in the frame {spelled(frame)}" if frame else ""
+    return f"  topic: {spelled(found[0].name)}  {GUESS}{of}{others}\n"
 
 
 def _header_frame(bag: Bag, topic: Topic) -> str:
@@ -136,10 +135,3 @@ def _nearest(topic: str, others: list[str]) -> str | None:
     """The topic in the same namespace."""
     same = [each for each in others if each.rpartition("/")[0] == topic.rpartition("/")[0]]
     return same[0] if same else None
-
-
-def _plain(name: str) -> str:
-    """A name that stands in YAML as it is; one that would not is quoted."""
-    if all(each.isalnum() or each in "/_.-" for each in name) and yaml.safe_load(name) == name:
-        return name
-    return "'" + visible(name).replace("'", "''") + "'"

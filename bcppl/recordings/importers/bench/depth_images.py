@@ -6,10 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
 from bcppl.arrays import Array
 from bcppl.errors import InputError
+from bcppl.recordings.array_files import npy
+from bcppl.recordings.hdf5 import one_line
+from bcppl.recordings.image_files import opened
 from bcppl.recordings.importers.bench.configuration.camera_fields import CameraFields
 from bcppl.recordings.importers.bench.configuration.field_types import Length, factor
 
@@ -57,16 +59,16 @@ def _pixels(path: Path) -> Array:
         pixels: Any = _exr(path)
     elif kind == ".npy":
         try:
-            pixels = np.load(path, allow_pickle=False)
-        except (OSError, ValueError, EOFError) as error:
-            raise InputError(f"{path} holds no plain numbers; save it again.") from error
+            pixels = npy(path)
+        except Exception as error:  # numpy has errors of many types
+            raise InputError(f"{path} holds no plain numbers ({one_line(error)}); save it again.") from error
     elif kind in (".png", ".tif", ".tiff"):
         try:
-            with Image.open(path) as image:
+            with opened(path, ["PNG", "TIFF"]) as image:
                 pixels = np.asarray(image)
-        except OSError as error:
+        except Exception as error:  # Pillow raises SyntaxError, struct.error, zlib.error and others
             raise InputError(
-                f"{path} is no image ({error}); export the depth again as 16 bit PNG."
+                f"{path} is no image ({one_line(error)}); export the depth again as 16 bit PNG."
             ) from error
         if pixels.dtype == np.uint8:
             raise InputError(f"{path} has 8 bits, too few for a depth; export it as 16 bit PNG or .npy.")

@@ -13,6 +13,8 @@ import numpy as np
 
 from bcppl.arrays import Array
 from bcppl.errors import InputError
+from bcppl.recordings.array_files import npy, npz
+from bcppl.recordings.hdf5 import one_line
 
 Names = Sequence[str | int]
 _ELEMENT = re.compile(r"(.+)\[(\d+)\]")  # a column of an array (T, C): "wrench[3]"
@@ -55,10 +57,10 @@ def _csv(path: Path, names: Names) -> Array:
     comments = [k for k, line in enumerate(lines) if line.startswith("#") or not line.strip()]
     first = next((k for k in range(len(lines)) if k not in comments), 0)
     delimiter = next((each for each in _DELIMITERS if each in lines[first]), None)
-    cells = _cells(lines[first], delimiter)
+    cells = _cells(path, lines[first], delimiter)
     if all(map(is_number, cells)):
         # Names may stand in the last comment before the numbers, as numpy writes them.
-        above = _cells(lines[first - 1].lstrip("# "), delimiter) if first else []
+        above = _cells(path, lines[first - 1].lstrip("# "), delimiter) if first else []
         known, skipped = (above if len(above) == len(cells) else []), first
     else:
         known, skipped = cells, first + 1
@@ -76,10 +78,13 @@ def _csv(path: Path, names: Names) -> Array:
     return np.asarray(table, dtype=np.float64)
 
 
-def _cells(line: str, delimiter: str | None) -> list[str]:
+def _cells(path: Path, line: str, delimiter: str | None) -> list[str]:
     if delimiter is None:
         return line.split()
-    return [cell.strip() for row in csv.reader([line.strip()], delimiter=delimiter) for cell in row]
+    try:
+        return [cell.strip() for row in csv.reader([line.strip()], delimiter=delimiter) for cell in row]
+    except csv.Error as error:
+        raise InputError(f"{path} is no table ({one_line(error)}); export it as CSV again.") from error
 
 
 def is_number(cell: str) -> bool:
@@ -111,15 +116,11 @@ def _missing(path: Path, name: str, known: Sequence[str]) -> str:
     return f"{path} has no column {name!r}; {meant}"
 
 
-def _load(path: Path) -> Any:
-    try:
-        return np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise InputError(f"{path} holds no plain numbers; save it again, without objects.") from error
-
-
 def _npy(path: Path, names: Names) -> Array:
-    array = _load(path)
+    try:
+        array = npy(path)
+    except Exception as error:  # numpy has errors of many types
+        raise _unreadable(path, error) from error
     fields = array.dtype.names
     if fields is None:
         if array.ndim != 2:
@@ -129,8 +130,18 @@ def _npy(path: Path, names: Names) -> Array:
 
 
 def _npz(path: Path, names: Names) -> Array:
-    with _load(path) as arrays:
-        return _by_name(path, names, list(arrays.files), lambda name: arrays[name])
+    try:
+        with npz(path) as arrays:
+            return _by_name(path, names, list(arrays.files), lambda name: arrays[name])
+    except InputError:
+        raise
+    except Exception as error:  # zip files and numpy have errors of many types
+        raise _unreadable(path, error) from error
+
+
+def _unreadable(path: Path, error: Exception) -> InputError:
+    cause = one_line(error)
+    return InputError(f"{path} holds no plain numbers ({cause}); save it again, without objects.")
 
 
 def _parquet(path: Path, names: Names) -> Array:

@@ -8,14 +8,13 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from PIL import Image
 
 from bcppl.arrays import Array
 from bcppl.errors import InputError
+from bcppl.recordings.image_files import opened
 
 DEPTHS: dict[str, tuple[str, ...]] = {".png": ("I;16", "I"), ".tif": ("I;16",), ".tiff": ("I;16",)}  # modes
 COLOURS: dict[str, tuple[str, ...]] = {".png": ("RGB",), ".jpg": ("RGB",)}
-MOST_PIXELS = 8 << 20  # beyond one for each byte of the file: an image of depth takes 64 MB
 _FORMATS = {".png": "PNG", ".jpg": "JPEG", ".tif": "TIFF", ".tiff": "TIFF"}
 
 
@@ -42,9 +41,7 @@ def pixels(path: Path, modes: Sequence[str]) -> npt.NDArray[Any]:
         InputError: it is missing, has none of the modes, is damaged, or too large for the bytes it has.
     """
     try:
-        with _opened(path) as image:
-            image.verify()  # reads all chunks, and none of the pixels
-        with _opened(path) as image:
+        with opened(path, [_FORMATS[path.suffix]]) as image:
             if image.mode not in modes:
                 raise ValueError(f"its mode is {image.mode}, not {' or '.join(modes)}")
             return np.asarray(image)
@@ -52,11 +49,3 @@ def pixels(path: Path, modes: Sequence[str]) -> npt.NDArray[Any]:
         reason = getattr(error, "strerror", None) or " ".join(str(error).split()) or type(error).__name__
         what = f"{path} is missing or is no image that can be read ({reason})"
         raise InputError(f"{what}; give the folder of a BOP scene.") from error
-
-
-def _opened(path: Path) -> Image.Image:
-    """An image file whose header alone is read: formats that Pillow gives to other programs are none."""
-    image = Image.open(path, formats=[_FORMATS[path.suffix]])
-    if image.width * image.height > MOST_PIXELS + path.stat().st_size:
-        raise ValueError(f"it claims {image.width} x {image.height} pixels in {path.stat().st_size} bytes")
-    return image

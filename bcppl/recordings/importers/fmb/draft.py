@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from bcppl.recordings.importers.bench.configuration.drafts import GUESS, drafted, offer, refuse_place
+from bcppl.recordings.importers.bench.configuration.drafts import GUESS, drafted, offer, refuse_place, spelled
 from bcppl.recordings.importers.fmb.reading import FORCE, POSE, Trajectory
 from bcppl.visible_text import visible
 
@@ -53,8 +53,8 @@ def _configuration(trajectory: Trajectory, spans: list[list[float]]) -> str:
             short = name.rpartition("/")[2].removesuffix(_DEPTH)
             place = "frame_from_camera" if short.startswith("wrist") else "world_from_camera"
             cameras += (
-                f"  {visible(short)}:  {GUESS}\n"
-                f"    {{topic: {visible(name)}, fx: 245, fy: 325, cx: 127.5, cy: 127.5,  # pixels\n"
+                f"  {spelled(short)}:  {GUESS}\n"
+                f"    {{topic: {spelled(name)}, fx: 245, fy: 325, cx: 127.5, cy: 127.5,  # pixels\n"
                 f"     near: 0.1, far: 1.5, scale: 0.0001,     # metres per count: not documented\n"
                 f"     {place}: {{xyz: [0, 0, 0]}}, images: [{{time: 0.0}}]}}\n"
             )
@@ -62,5 +62,5 @@ def _configuration(trajectory: Trajectory, spans: list[list[float]]) -> str:
     more = (
         f"clock: {{wrench_late: 0}}  {GUESS}: both are of one message\ngravity: {{load: compensated}}\n{cut}"
     )
-    command = f"bcppl import fmb {visible(trajectory.path.name)} CONFIG"
+    command = f"bcppl import fmb {spelled(trajectory.path.name)} CONFIG"
     return drafted(command, "the file", streams, cameras, more)

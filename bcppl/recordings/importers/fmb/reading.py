@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import functools
 import itertools
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -19,17 +18,16 @@ import numpy as np
 
 from bcppl.arrays import Array
 from bcppl.errors import InputError
+from bcppl.recordings import array_files
 from bcppl.recordings.importers.bench.arrays import ArrayLog, Numbers, missing, refuse_axes, table, topics
 from bcppl.recordings.importers.bench.configuration.camera_fields import CameraFields, ImageFields
 from bcppl.recordings.importers.bench.configuration.field_types import factor
 from bcppl.recordings.importers.bench.configuration.fields import BenchFields, StreamFields
 from bcppl.recordings.importers.bench.depth_images import in_metres
 from bcppl.recordings.importers.bench.sources import Shot
-from bcppl.recordings.structure import limit
 
 POSE, FORCE, PRIMITIVE = "obs/tcp_pose", "obs/tcp_force", "primitive"
 _MAGIC = b"\x93NUMPY"
-_END = ".npy"  # of the members of an .npz file
 _HALF = 0.5  # rows from an image's time within which a row is
 
 
@@ -55,17 +53,9 @@ class Trajectory:
                     "convert it to .npz once, by the line in docs/import_bench.md."
                 )
         try:
-            with zipfile.ZipFile(path) as packed:
-                sizes = {each.filename: each.file_size for each in packed.infolist()}
-                if len(sizes) < len(packed.infolist()):
-                    raise ValueError("a name is given twice")
-                if sum(sizes.values()) > limit(path.stat().st_size):
-                    raise ValueError("it claims more numbers than its size explains")
-                if damaged := packed.testzip():
-                    raise ValueError(f"the checksum of {damaged} is wrong")
+            self.names = array_files.members(path, checksums=True)
         except Exception as error:  # zip files have errors of many types
             raise _unreadable(path, error) from error
-        self.names = sorted(name.removesuffix(_END) for name in sizes if name.endswith(_END))
 
     def array(self, field: str, name: str) -> Any:
         """An array of numbers or text.

@@ -9,7 +9,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from bcppl.errors import InputError
-from bcppl.recordings.importers.bench.configuration.drafts import GUESS, drafted, offer, refuse_place
+from bcppl.recordings.importers.bench.configuration.drafts import GUESS, drafted, offer, refuse_place, spelled
 from bcppl.recordings.importers.reassemble.reading import Segment, arrays, board, segments, span
 from bcppl.visible_text import visible
 
@@ -64,5 +64,5 @@ def _configuration(path: Path, actions: list[Segment], zero: float) -> str:
     ]
     cut = f"cut: {{spans: {spans}}}  {GUESS}: the insertions that succeeded\n" if spans else ""
     more = f"gravity: {{load: compensated}}\n{cut}"
-    command = f"bcppl import reassemble {visible(path.name)} CONFIG"
+    command = f"bcppl import reassemble {spelled(path.name)} CONFIG"
     return drafted(command, "the file", streams, "", more)

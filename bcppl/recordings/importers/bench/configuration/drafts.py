@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from importlib.resources import files
 from pathlib import Path
 
+import yaml
 from rich.console import Console
 
 from bcppl.errors import InputError
@@ -32,6 +34,22 @@ def drafted(command: str, source: str, streams: str, cameras: str, more: str = "
         "\npart:", f"\n# Lines with {GUESS[2:]!r} come from {source}; all others are examples.\npart:"
     )
     return "".join([head, streams, frames, cameras, more, after])
+
+
+def spelled(name: str) -> str:
+    """A name from a log as YAML has it within one line, in quotes where it would read as something else.
+
+    A line break in a name would otherwise begin a field, in a comment too.
+    """
+    plain = name.isprintable()
+    text = yaml.safe_dump(
+        [name],
+        default_flow_style=True,
+        default_style=None if plain else '"',
+        allow_unicode=plain,
+        width=math.inf,
+    )
+    return str(text).strip()[1:-1]
 
 
 def refuse_place(write: Path | None) -> None:

@@ -9,9 +9,12 @@ from typing import Any
 import yaml
 from pydantic import BaseModel, ValidationError
 
+from bcppl.arguments import named
 from bcppl.errors import InputError
+from bcppl.recordings.hdf5 import one_line
 from bcppl.recordings.importers.bench.configuration.fields import BenchFields
 from bcppl.recordings.importers.bench.table import is_number
+from bcppl.visible_text import visible
 
 _TYPES = {
     "float_type": "a number",
@@ -28,10 +31,30 @@ _BOUNDS = {
     "less_than": ("below", "lt"),
     "less_than_equal": ("of at most", "le"),
 }
+_LONGEST = 120  # characters of a name or of a cause that are quoted
 
 
 class _Loader(yaml.SafeLoader):
-    """The safe loader, which makes plain values alone; it also refuses a field that stands twice."""
+    """The safe loader, which makes plain values alone; it refuses a field that stands twice, and aliases."""
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        """A node that is no alias: a few lines of aliases of aliases stand for gigabytes."""
+        if self.check_event(yaml.AliasEvent):
+            event = self.peek_event()
+            problem = f"the alias {named('{}', event.anchor)} has to be written out"
+            raise yaml.composer.ComposerError(None, None, problem, event.start_mark)
+        return super().compose_node(parent, index)
+
+    def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
+        """A value; one that is none of the type that YAML reads from its form or tag is refused."""
+        try:
+            return super().construct_object(node, deep)
+        except (yaml.YAMLError, RecursionError):
+            raise
+        except Exception as error:  # dates and numbers have errors of many types
+            kind = node.tag.rpartition(":")[2]
+            problem = f"{named('{}', node.value)} is no {kind}, and text needs quotes,"
+            raise yaml.constructor.ConstructorError(None, None, problem, node.start_mark) from error
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         """A mapping whose keys differ."""
@@ -40,7 +63,7 @@ class _Loader(yaml.SafeLoader):
             name = getattr(key, "value", None)
             if isinstance(name, str) and name in seen:
                 raise yaml.constructor.ConstructorError(
-                    None, None, f"the field {name!r} stands there twice", key.start_mark
+                    None, None, named("the field {} stands there twice", name), key.start_mark
                 )
             seen.add(name if isinstance(name, str) else id(key))
         return super().construct_mapping(node, deep)
@@ -68,7 +91,7 @@ def read_configuration(path: Path) -> BenchFields:
 
 def _cause(error: BaseException) -> str:
     mark = getattr(error, "problem_mark", None)
-    what = getattr(error, "problem", None) or " ".join(str(error).split())
+    what = _short(getattr(error, "problem", None) or one_line(error))
     return f"{what} in line {mark.line + 1}" if mark is not None else str(what)
 
 
@@ -76,7 +99,8 @@ def _sentence(error: ValidationError, content: dict[Any, Any]) -> str:
     """The first mistake; one in a field's type stands before what follows from it."""
     first: Any = error.errors(include_url=False)[0]
     kind, given = first["type"], first["input"]
-    place = [str(each) for each in first["loc"]]
+    place = [_short(str(each)) for each in first["loc"]]
+    value = named("{}", given)
     where = _dotted(place) or "the configuration"
     if kind == "missing":
         return f"{_dotted(place[:-1]) or 'the configuration'} lacks {place[-1]!r}; add it."
@@ -86,22 +110,28 @@ def _sentence(error: ValidationError, content: dict[Any, Any]) -> str:
         meant = f"write {close[0]!r} if that is meant." if close else f"its fields are {', '.join(known)}."
         return f"{_dotted(place[:-1]) or 'the configuration'} has no field {place[-1]!r}; {meant}"
     if kind == "literal_error":
-        return f"{where} is {given!r}; give {first['ctx']['expected']}."
+        return f"{where} is {value}; give {first['ctx']['expected']}."
     if kind in _BOUNDS:
         word, name = _BOUNDS[kind]
-        return f"{where} is {given!r}; give a number {word} {first['ctx'][name]:g}."
+        return f"{where} is {value}; give a number {word} {first['ctx'][name]:g}."
     if kind in ("too_short", "too_long"):
         bound = first["ctx"].get("min_length", first["ctx"].get("max_length"))
         side = "at least" if kind == "too_short" else "at most"
         return f"{where} has {len(given)} entries; give {side} {bound}."
     if kind == "finite_number":
-        return f"{where} is {given!r}; give a finite number."
+        return f"{where} is {value}; give a finite number."
     if kind == "float_type" and isinstance(given, str) and is_number(given):
-        return f"{where} is {given!r}, which YAML reads as text; write {float(given)!r}."
+        return f"{where} is {value}, which YAML reads as text; write {float(given)!r}."
     if kind in _TYPES:
-        return f"{where} is {given!r}; give {_TYPES[kind]}."
+        return f"{where} is {value}; give {_TYPES[kind]}."
     message = str(first.get("ctx", {}).get("error", first["msg"])).rstrip(".")
     return f"{where} {message}."
+
+
+def _short(text: str) -> str:
+    """Text of the file in one line, no more of it than one reads."""
+    line = " ".join(visible(text).split())
+    return line if len(line) <= _LONGEST else f"{line[:_LONGEST]}…"
 
 
 def _dotted(place: list[str]) -> str:
