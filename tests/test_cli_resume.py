@@ -85,6 +85,16 @@ def test_what_a_folder_holds_is_never_written_over(bcppl: Callable[..., Ran], tm
     assert "--resume runs/short" in ran.err
 
 
+def test_beliefs_without_a_step_to_go_on_from_are_kept(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
+    save(short(1), tmp_path / "short.h5")
+    assert bcppl("run", "short.h5", "--particles", 4, "--inference", FEW_MOVES, "--out", "out").code == 0
+    (tmp_path / "out/step.h5").unlink()
+    before = sorted((file.name, file.read_bytes()) for file in (tmp_path / "out").iterdir())
+    ran = bcppl("run", "--resume", "out", "--inference", FEW_MOVES)
+    assert ran.code == 2 and "has beliefs and no step.h5 to go on from" in ran.err
+    assert sorted((file.name, file.read_bytes()) for file in (tmp_path / "out").iterdir()) == before
+
+
 def test_what_cannot_be_resumed_is_refused(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
     save(short(1), tmp_path / "short.h5")
     save(short(2), tmp_path / "other.h5")

@@ -33,7 +33,6 @@ from bcppl.inference.structures import (
     translation,
     within,
 )
-from bcppl.inference.structures.moves import MovedStrata
 from bcppl.inference.structures.translation import sampling_nothing
 from bcppl.inference.targets import POSTERIOR, Target
 from bcppl.traces import Structure, Trace, generate, structural
@@ -223,13 +222,6 @@ def test_chains_over_structures_reach_the_posterior_from_one_of_them() -> None:
         if moves >= 12:
             shares.append([strata.shares.get(Structure({"count": k}), 0.0) for k in range(3)])
     torch.testing.assert_close(matrix(shares).mean(0), POSTERIOR_OF_COUNT, rtol=0.0, atol=0.03)
-
-
-def test_a_jump_that_nobody_made_in_a_round_has_no_share_of_it() -> None:
-    torch.manual_seed(0)
-    rounds = iter([(math.nan, 0.5), (0.25, math.nan)] * 2)
-    both = in_turn(lambda strata, target: MovedStrata(strata, next(rounds)), times=2)
-    assert both(exact_strata(10), POSTERIOR).acceptance == (0.25, 0.5)
 
 
 def test_weights_go_with_their_particles() -> None:

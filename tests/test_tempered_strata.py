@@ -17,14 +17,15 @@ from bcppl.inference.structures import (
     Strata,
     extend_strata,
     generate_strata,
+    in_turn,
     jump,
     resample_strata,
     tempered_strata,
 )
-from bcppl.inference.targets import Target
+from bcppl.inference.targets import POSTERIOR, Target
 from bcppl.traces import structural
 from tests.invariance import matrix, number
-from tests.structural_programs import SEEN, summed
+from tests.structural_programs import SEEN, exact_strata, summed
 
 OBSERVED = {"y": SEEN}
 ACROSS = Jump(
@@ -106,3 +107,10 @@ def test_old_sites_of_a_structure_that_was_lost_are_not_tempered() -> None:
         ratios.append(math.exp(strata.log_evidence) / exact)
     found = torch.tensor(ratios)
     assert abs(float(found.mean()) - 1.0) < 4.0 * float(found.std()) / math.sqrt(150) + 1e-3
+
+
+def test_a_jump_that_nobody_made_in_a_round_has_no_share_of_it() -> None:
+    torch.manual_seed(0)
+    rounds = iter([(math.nan, 0.5), (0.25, math.nan)] * 2)
+    both = in_turn(lambda strata, target: MovedStrata(strata, next(rounds)), times=2)
+    assert both(exact_strata(10), POSTERIOR).acceptance == (0.25, 0.5)

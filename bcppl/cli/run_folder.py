@@ -66,11 +66,13 @@ class RunFolder:
             path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise InputError(f"{path} cannot be made ({error.strerror}); give another --out.") from error
-        if begun:
-            for old in _written(path):
-                old.unlink()
-        else:
+        if not begun:
             _claim(path)
+        elif (path / belief_name(1)).exists():
+            raise InputError(
+                f"the run in {path} has beliefs and no {STEP} to go on from; run the recording again into "
+                "another folder."
+            )
         self.note(complete=False, rows=[], checked={})
 
     @classmethod

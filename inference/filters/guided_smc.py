@@ -188,9 +188,8 @@ def guided(
                 ancestors=descended(info.ancestors, chosen, len(population)),
             )
         gained = other.log_evidence - population.log_evidence
-        other = rejuvenation(
-            other, POSTERIOR
-        ).population  # nothing is resampled: all weigh alike, or as before
+        # Nothing is resampled: all weigh alike, or as before the search.
+        other = rejuvenation(other, POSTERIOR).population
         size = other.effective_sample_size
         return Stepped(
             other, info._replace(log_evidence=info.log_evidence + gained, effective_sample_size=size)

@@ -33,9 +33,9 @@ from bcppl.inference.planning.insertion import InsertionParameters, insertion_pl
 from bcppl.inference.sizing import resize
 from bcppl.robot.arm_with_peg import ArmWithPeg
 from bcppl.robot.plan import InsertionPlan
-from bcppl.sensors import Measurement, Recording
+from bcppl.sensors import Measurement, Recording, checks
 from bcppl.sensors.candidates import Candidate, with_candidates
-from bcppl.sensors.layout import same
+from bcppl.sensors.layout import link
 from bcppl.sensors.protocol import InParts, sensor_for
 from bcppl.traces import Model
 from bcppl.viewer.live import LivePage
@@ -111,7 +111,7 @@ class Filter:
         self._changed = threading.Condition()
         self._updates: deque[Update] = deque(maxlen=KEPT)
         self._pages: list[LivePage] = []
-        self._shared: dict[tuple[str, str], Any] = {}
+        self._shared: dict[str, dict[str, Any]] = {}  # by kind and name, such as cameras
         self._failed: BaseException | None = None
         self._thread = ThreadPoolExecutor(1, "bcppl live")
         try:
@@ -355,18 +355,11 @@ class Filter:
             raise InputError(problem)
         for name, kept in sensor.action.fields.items():
             if kept.group:
-                self._refuse_namesake(kept.group, getattr(measurement.action, name))
-
-    def _refuse_namesake(self, group: str, thing: Any) -> None:
-        """Refuse a camera, a probe or the like that has the name of another one, or none."""
-        if not thing.name:
-            raise InputError(f"one of {group} has an empty name; name each.")
-        with self._changed:
-            known = self._shared.setdefault((group, thing.name), thing)
-        if not same(known, thing):
-            raise InputError(
-                f"{thing.name!r} of {group} differs from an earlier one of that name; name it otherwise."
-            )
+                thing = getattr(measurement.action, name)
+                link(thing.name)  # refuses an empty one
+                known = self._shared.setdefault(kept.group, {})
+                for problem in checks.named_alike(f"measurement {number}", kept.group, thing, known):
+                    raise InputError(problem)
 
 
 def resized(step: Step, count: int) -> Step:

@@ -143,7 +143,8 @@ def run(
     finally:
         # Whatever stopped the run, what was computed is shown and kept.
         if not folder.history:
-            folder.discard()
+            if resume is None:
+                folder.discard()
         else:
             folder.note(
                 warnings=report.finish(),

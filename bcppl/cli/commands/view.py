@@ -47,10 +47,7 @@ def view(
             raise InputError(f"--of names a run's recording, but {run} is no folder of a run; leave it out.")
         page, place = of_recording(run, arm), Path(f"{folder.stem}.{PAGE}")
     place = save or place
-    if not folder.is_dir():
-        refuse_overwriting("--save", place, run)
-    elif of is not None:
-        refuse_overwriting("--save", place, of)
+    refuse_overwriting("--save", place, run, of)
     page.save(place)
     print(f"wrote {place}: {page.steps} steps, {len(page.text) / 1e6:.1f} MB; it needs no other file.")
     if save is None and not webbrowser.open(place.resolve().as_uri()):
