@@ -21,6 +21,7 @@ from bcppl.inference.kernels import (
     mixture,
     moved_by,
     repeat,
+    sequence,
     student_t,
     surrogate_transition,
 )
@@ -250,6 +251,23 @@ def test_a_transition_asks_each_costly_site_once_for_those_that_moved() -> None:
     assert torch.equal(accepted == 1.0, moved["x"] != trace["x"])
     fresh, _ = generate(program, (), OBSERVED, 2000)
     torch.testing.assert_close(moved.log_prob(), fresh.at({"x": moved["x"]}).log_prob())
+
+
+IN_ORDER = sequence(LEANING, WALK)
+
+
+@pytest.mark.parametrize(
+    "kernel",
+    [IN_ORDER, repeat(IN_ORDER, 2), cycle(IN_ORDER, WALK), mixture([WALK, delayed_acceptance(IN_ORDER)])],
+)
+def test_a_transition_refuses_moves_in_a_fixed_order(kernel: Kernel) -> None:
+    with pytest.raises(InputError, match="not reversible"):
+        surrogate_transition(kernel, student_t("x"))
+
+
+def test_an_order_that_reads_the_same_backwards_is_reversible() -> None:
+    kernel = surrogate_transition(sequence(WALK, LEANING, WALK), lambda _: lambda trace: -2.0 * trace["x"])
+    assert worst_z(kernel) < SOUND
 
 
 def test_sites_that_count_for_nothing_are_not_asked() -> None:

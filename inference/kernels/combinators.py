@@ -21,7 +21,20 @@ from bcppl.inference.targets import Target
 from bcppl.traces import Trace
 
 
-def _one_after_another(kernels: Sequence[Kernel], order: Callable[[int], Iterable[int]]) -> Kernel:
+def reversible(kernel: Kernel) -> bool:
+    """Whether a kernel's moves obey detailed balance: all but a `sequence`."""
+    return bool(getattr(kernel, "reversible", True))
+
+
+def combined(kernel: Kernel, parts: Sequence[Kernel], *, symmetric: bool = True) -> Kernel:
+    """A combination, reversible where all its parts and the order of them are."""
+    vars(kernel)["reversible"] = symmetric and all(map(reversible, parts))
+    return kernel
+
+
+def _one_after_another(
+    kernels: Sequence[Kernel], order: Callable[[int], Iterable[int]], *, symmetric: bool = True
+) -> Kernel:
     """The moves of K kernels by number, in the order that `order(K)` gives for each move."""
 
     def together(population: Population) -> Move:
@@ -36,7 +49,7 @@ def _one_after_another(kernels: Sequence[Kernel], order: Callable[[int], Iterabl
 
         return move
 
-    return together
+    return combined(together, kernels, symmetric=symmetric)
 
 
 def _listed(name: str, kernels: Sequence[Kernel | Sequence[Kernel]]) -> list[Kernel]:
@@ -52,7 +65,8 @@ def _listed(name: str, kernels: Sequence[Kernel | Sequence[Kernel]]) -> list[Ker
 
 def sequence(*kernels: Kernel | Sequence[Kernel]) -> Kernel:
     """One kernel after another, in the order given, one by one or as a list."""
-    return _one_after_another(_listed("sequence", kernels), range)
+    listed = _listed("sequence", kernels)
+    return _one_after_another(listed, range, symmetric=listed == listed[::-1])
 
 
 def cycle(*kernels: Kernel | Sequence[Kernel]) -> Kernel:
@@ -105,7 +119,7 @@ def mixture(kernels: Sequence[Kernel] | Kernel, *more: Any, weights: Sequence[fl
 
         return move
 
-    return together
+    return combined(together, listed)
 
 
 def repeat(kernel: Kernel, times: int) -> Kernel:

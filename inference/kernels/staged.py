@@ -17,6 +17,7 @@ from torch import Tensor
 
 from bcppl.arguments import number_within, whole_number
 from bcppl.errors import InputError
+from bcppl.inference.kernels.combinators import combined, reversible
 from bcppl.inference.kernels.kernel import Kernel, Move, fitted, refuse_other, scattered
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import spread_of
@@ -201,7 +202,7 @@ def delayed_acceptance(
 
         return in_stages
 
-    return staged
+    return combined(staged, [kernel])
 
 
 def surrogate_transition(kernel: Kernel, surrogate: Surrogate) -> Kernel:
@@ -210,7 +211,7 @@ def surrogate_transition(kernel: Kernel, surrogate: Surrogate) -> Kernel:
     Liu, Monte Carlo Strategies in Scientific Computing, Springer, 2001, section 9.4.3: the last decision is
     on the ratio of the target to the surrogate, so that costly sites are evaluated once, however many moves
     come before. The moves are to be reversible together, as one Metropolis-Hastings move is, and as several
-    in random order are (`cycle`); `sequence` of them is not.
+    in random order are (`cycle`); a `sequence` of different ones is not.
 
     Args:
         kernel: of these moves. A particle is moved as often as `repeat` asks for.
@@ -218,9 +219,14 @@ def surrogate_transition(kernel: Kernel, surrogate: Surrogate) -> Kernel:
             that are moved.
 
     Raises:
-        InputError: what is given is no kernel.
+        InputError: what is given is no kernel, or has a `sequence` that does not read the same backwards.
     """
     refuse_other("surrogate_transition", kernel)
+    if not reversible(kernel):
+        raise InputError(
+            "surrogate_transition is given a sequence of kernels, which is not reversible, so that the "
+            "decision about where they led would be biased; put them in a cycle, which draws their order."
+        )
 
     def fit(population: Population) -> Move:
         move, log_density = fitted(kernel, population), surrogate(population)
