@@ -12,7 +12,9 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.contact import stepping
 from bcppl.contact.nuisances import Nuisances
+from bcppl.contact.particle_models import ParticleModels
 from bcppl.contact.physics import PegPhysics, Rollout
 from bcppl.contact.probe_rollout import ProbeRollout
 from bcppl.contact.sensing.location import ContactSensing
@@ -88,6 +90,15 @@ def test_equal_values_change_nothing_to_the_bit(skip: bool) -> None:
 def merged_where(mask: Tensor, one: Nuisances, other: Nuisances) -> Nuisances:
     pairs = [(name, value, other.given[name]) for name, value in one.given.items()]
     return Nuisances(**{n: torch.where(mask.reshape(-1, *[1] * (a.ndim - 1)), a, b) for n, a, b in pairs})
+
+
+def test_many_particles_share_a_bounded_number_of_models(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = PegPhysics(HOLE, PEG).start(around(), SEARCH, mixed()).advance(120)
+    made, copied = [], ParticleModels._copied
+    monkeypatch.setattr(ParticleModels, "_copied", lambda self: made.append(self) or copied(self))
+    monkeypatch.setattr(stepping, "_COPIES", 4)
+    same(whole, PegPhysics(HOLE, PEG).start(around(), SEARCH, mixed()).advance(50).advance(120))
+    assert max(map(made.count, made)) == 4
 
 
 def test_chunks_order_and_merging_change_nothing() -> None:

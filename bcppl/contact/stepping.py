@@ -23,6 +23,7 @@ _CONTROL = int(
 )
 _CONTROLS = 20  # six forces, then the positions of command and part, then their quaternions
 _BLOCK = 32 * 2**20  # bytes that one call of mujoco.rollout may fill
+_COPIES = 1024  # models that differ in nuisance parameters, half a megabyte each
 POSE, WRENCH, NORMAL = slice(0, 7), slice(7, 13), slice(13, 16)  # columns of a sensor row
 
 
@@ -86,6 +87,14 @@ class Stepper:
         begin in the states after `first` stamps, with nuisances (N, ...) from
         `grasp_compliance.springs_in_series`.
         """
+        if nuisances and len(begin.state) > _COPIES:
+            every = range(0, len(begin.state), _COPIES)
+            parts = [
+                self.run(begin[k], world_from_part[k], {n: v[k] for n, v in nuisances.items()}, first, last)
+                for k in (slice(at, at + _COPIES) for at in every)
+            ]
+            readings, states = zip(*parts, strict=True)
+            return np.concatenate(readings), SimulationState.joined(states)
         start, stop = self.step_after(first), self.step_after(last)
         sensed = np.empty((len(begin.state), stop - start, SENSOR_COLUMNS))
         state = begin.state
