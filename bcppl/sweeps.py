@@ -217,12 +217,11 @@ def _parallel(
         yield from map(function, arguments)
         return
     from joblib import Parallel, delayed, parallel_config
-    from joblib._parallel_backends import LokyBackend
     from joblib.parallel import get_active_backend
 
     settings: dict[str, Any] = {"n_jobs": jobs, "batch_size": 1}
     backend, _ = get_active_backend()
-    if isinstance(backend, LokyBackend):
+    if backend.supports_inner_max_num_threads:
         with parallel_config("loky", inner_max_num_threads=1):
             workers = Parallel(return_as=returned, **settings)
     elif backend.supports_return_generator:

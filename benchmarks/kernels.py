@@ -23,7 +23,7 @@ from kernel_table import POSES, VECTORS
 from report import DATA, Row, finish, options, show
 
 from bcppl import poses
-from bcppl.inference.filters.smc import smc, tempered
+from bcppl.inference import smc, tempered
 from bcppl.inference.kernels import Kernel
 from bcppl.models import part_in_view
 from bcppl.recordings.importers.bop import command

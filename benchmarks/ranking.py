@@ -166,7 +166,7 @@ def larger(setting: Setting, particles: int) -> Setting:
     trace = setting.population.trace.chosen(chosen)
     away = 1e-4 * torch.randn(particles, 6, dtype=torch.float64)
     moved = trace.at({ADDRESS: poses.retract(trace[ADDRESS], away)})
-    return setting._replace(population=Population(moved, torch.zeros(particles, dtype=torch.float64)))
+    return setting._replace(population=Population(moved))
 
 
 def growth(counts: Sequence[int], seconds: Sequence[float]) -> float:

@@ -132,7 +132,7 @@ def _of_chains(arviz: Any, chains: Chains, draws: int | None) -> Any:
     recorded = min((len(states) for states in chains.draws.values()), default=0)
     draws = recorded if draws is None else draws
     draws = whole_number(f"{{}} draws were asked for of chains with {recorded} states", draws, most=recorded)
-    last = Population(chains.trace, torch.zeros(len(chains.trace), dtype=torch.float64))
+    last = Population(chains.trace)
     # Chains are recorded move by move.
     posterior = {address: states[-draws:].movedim(1, 0) for address, states in chains.draws.items()}
     acceptance = chains.acceptance[:, None].expand(-1, draws)

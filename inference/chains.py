@@ -99,7 +99,7 @@ def markov_chains(
     every = whole_number("chains are to be recorded every {} moves", every)
     warm_up = whole_number("chains are to warm up for {} moves", warm_up, least=0)
     if isinstance(start, Trace):
-        start = Population(start, torch.zeros(start.particles, dtype=torch.float64))
+        start = Population(start)
     population = start
     weights = population.log_weights
     if scheme is not None and bool((weights != weights[0]).any()):

@@ -101,9 +101,8 @@ def tempered_importance_sampling(
     if not isinstance(step, Tempered):
         name = getattr(step, "__name__", type(step).__name__)
         raise InputError(f"{name} is given in place of a step that tempers; give tempered(kernel).")
-    trace, log_likelihood = generate(program, args, observations, particles)
-    prior = Population(trace, torch.zeros_like(log_likelihood))
-    return step.temper(prior, [a for a in trace.addresses if a not in trace.choices])
+    trace, _ = generate(program, args, observations, particles)
+    return step.temper(Population(trace), [a for a in trace.addresses if a not in trace.choices])
 
 
 def generate_stratified(

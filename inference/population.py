@@ -22,6 +22,8 @@ from bcppl.traces import Trace
 from bcppl.traces.indexing import Index, particles_at
 from bcppl.traces.verbs import at_device
 
+EQUAL = torch.empty(0, dtype=torch.float64)  # in place of log weights: all are equal
+
 
 @dataclass(frozen=True, eq=False)
 class Population:
@@ -35,7 +37,8 @@ class Population:
 
     Attributes:
         trace: of N particles.
-        log_weights: (N,) unnormalised, float64 (made so, if they are of another type); -inf is no weight.
+        log_weights: (N,) unnormalised, float64 (made so, if they are of another type); -inf is no weight. By
+            default all are equal.
         log_evidence: log of the estimated evidence of all measurements so far; by default the log of the mean
             weight, which is right for what `generate` returns.
         founders: (N,) int64, the particle of the first population that each descends from; by default
@@ -50,7 +53,7 @@ class Population:
     """
 
     trace: Trace
-    log_weights: Tensor
+    log_weights: Tensor = EQUAL
     log_evidence: float = math.nan
     founders: Tensor = field(default_factory=lambda: torch.empty(0, dtype=torch.int64), repr=False)
     log_pairs: float = math.nan
@@ -59,6 +62,8 @@ class Population:
     approximation: Any = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
+        if self.log_weights is EQUAL:
+            object.__setattr__(self, "log_weights", torch.zeros(self.trace.particles, dtype=torch.float64))
         object.__setattr__(self, "log_weights", _checked(self.trace, self.log_weights))
         if math.isnan(self.log_evidence):
             object.__setattr__(self, "log_evidence", _log_mean(self.log_weights))

@@ -8,9 +8,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bcppl.inference.population import Population
-from bcppl.traces import Trace
-
 
 def number(value: float) -> Tensor:
     return torch.tensor(value, dtype=torch.float64)
@@ -18,10 +15,6 @@ def number(value: float) -> Tensor:
 
 def matrix(rows: Any) -> Tensor:
     return torch.tensor(rows, dtype=torch.float64)
-
-
-def equal_weights(trace: Trace) -> Population:
-    return Population(trace, torch.zeros(len(trace), dtype=torch.float64))
 
 
 def largest_z(before: Tensor, after: Tensor, still: float = 1e-12) -> float:

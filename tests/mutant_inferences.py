@@ -14,7 +14,7 @@ from torch import Tensor
 from bcppl.inference.calibration import Joint
 from bcppl.inference.population import Population
 from bcppl.traces import generate
-from tests.invariance import equal_weights, matrix, number
+from tests.invariance import matrix, number
 
 PARTICLES = 100
 # y = DESIGN (x_0, x_1, offset) + noise
@@ -96,7 +96,7 @@ def normal_inference(mutation: Mutation, data: Data) -> Population:
     root = torch.linalg.cholesky(posterior.covariance)
     values = posterior.mean + torch.randn(PARTICLES, 3, dtype=torch.float64) @ root.T
     trace, _ = generate(sought, (), data, PARTICLES, choices={"x": values[:, :2], "offset": values[:, 2]})
-    return equal_weights(trace)
+    return Population(trace)
 
 
 def folded_inference(modes: str, data: Data) -> Population:
@@ -112,7 +112,7 @@ def folded_inference(modes: str, data: Data) -> Population:
     places = torch.multinomial(density.softmax(0), PARTICLES, replacement=True)
     values = grid[places] + 0.0025 * (torch.rand(PARTICLES, dtype=torch.float64) - 0.5)
     trace, _ = generate(folded, (), data, PARTICLES, choices={"x": values})
-    return equal_weights(trace)
+    return Population(trace)
 
 
 NORMAL, FOLDED = Joint(sought, (), ("y",)), Joint(folded, (), ("y",))

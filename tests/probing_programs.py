@@ -12,7 +12,7 @@ from bcppl.distributions.poses import NormalPose
 from bcppl.inference.population import Population
 from bcppl.poses import FREE, Freedom
 from bcppl.traces import generate, simulate
-from tests.invariance import equal_weights, matrix
+from tests.invariance import matrix
 
 CENTER = poses.as_pose([0.1, -0.2, 0.3, 0.5, 0.5, -0.5, 0.5])
 SPREAD = [0.004, 0.002, 0.001, 0.02, 0.01, 0.03]
@@ -29,7 +29,7 @@ def placed(freedom: Freedom, axes: list[int], noise: float = 0.0005) -> None:
 
 def particles(count: int, freedom: Freedom = FREE, seed: int = 0) -> Population:
     torch.manual_seed(seed)
-    return equal_weights(simulate(placed, (freedom, []), count))
+    return Population(simulate(placed, (freedom, []), count))
 
 
 def at(world_from_part: Tensor, log_weights: Tensor | None = None, freedom: Freedom = FREE) -> Population:

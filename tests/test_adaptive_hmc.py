@@ -21,7 +21,7 @@ from bcppl.inference.population import Population
 from bcppl.inference.targets import POSTERIOR, Target
 from bcppl.traces import Trace, generate, simulate
 from tests.exact_targets import COVARIANCE, SEEN, bounded, correlated, correlated_draws
-from tests.invariance import equal_weights, largest_z, number
+from tests.invariance import largest_z, number
 
 SOUND, BROKEN = 4.5, 8.0
 BOUNDED = ("top", "shares", "each")
@@ -44,13 +44,13 @@ def worst_z(learned: Population, draws: Trace, *addresses: str, target: Any = PO
 def test_it_leaves_the_target_invariant_whatever_it_learns_from() -> None:
     torch.manual_seed(0)
     draws = correlated_draws(6000)
-    few = equal_weights(correlated_draws(2))
-    copies = equal_weights(correlated_draws(8)[torch.arange(200) % 8])
+    few = Population(correlated_draws(2))
+    copies = Population(correlated_draws(8)[torch.arange(200) % 8])
     off = correlated_draws(300)
     weighted = Population(off, 2.0 * off["x"][:, 0])
-    for learned in (equal_weights(correlated_draws(300)), few, copies, weighted):
+    for learned in (Population(correlated_draws(300)), few, copies, weighted):
         assert worst_z(learned, draws, "x") < SOUND
-    lone = equal_weights(correlated_draws(1))
+    lone = Population(correlated_draws(1))
     move = adaptive_hmc("x")(lone)
     assert largest_z(moments(draws, "x"), moments(move(draws, POSTERIOR)[0], "x")) < SOUND
 
@@ -64,13 +64,13 @@ def test_bounded_supports_and_tempered_targets() -> None:
         with pyro.plate("rows", 3, dim=-2):
             pyro.sample("each", dist.Beta(top, number(1.5)).expand([3, *top.shape]))
 
-    assert worst_z(equal_weights(simulate(program, (), 300)), simulate(program, (), 6000), *BOUNDED) < SOUND
+    assert worst_z(Population(simulate(program, (), 300)), simulate(program, (), 6000), *BOUNDED) < SOUND
     assert bounded is not program
     half = Target({"y": 0.5})
     posterior = torch.linalg.inv(torch.linalg.inv(COVARIANCE) + torch.eye(3).double() / 0.98)
     exact = torch.distributions.MultivariateNormal(posterior @ SEEN / 0.98, posterior)
     draws = correlated_draws(6000).at({"x": exact.sample((6000,))})
-    learned = equal_weights(correlated_draws(300))
+    learned = Population(correlated_draws(300))
     assert worst_z(learned, draws, "x", target=half) < SOUND
     assert worst_z(learned, draws, "x", target=POSTERIOR) > BROKEN
 
@@ -80,7 +80,7 @@ def test_one_fitted_move_is_tuned_to_each_target_by_itself(monkeypatch: pytest.M
     calls, sound = [], room.tuned
     monkeypatch.setattr(room, "tuned", lambda *a, **k: calls.append(a[2]) or sound(*a, **k))
     draws = correlated_draws(200)
-    move, half = adaptive_hmc("x")(equal_weights(draws)), Target({"y": 0.5})
+    move, half = adaptive_hmc("x")(Population(draws)), Target({"y": 0.5})
     for target in (POSTERIOR, half, POSTERIOR, Target({"y": 0.5})):
         move(draws, target)
     assert calls == [POSTERIOR, half]
@@ -96,7 +96,7 @@ def test_mutant_that_learns_from_each_particle_that_it_moves(monkeypatch: pytest
         return sound(gradient, position, momentum, size * position[:, :1].abs().clamp(0.1, 1.5), *rest)
 
     monkeypatch.setattr(hamiltonian, "leapfrog", own_size)
-    assert worst_z(equal_weights(correlated_draws(300)), draws, "x") > BROKEN
+    assert worst_z(Population(correlated_draws(300)), draws, "x") > BROKEN
 
 
 # ---- what is learned
@@ -122,7 +122,7 @@ def test_the_mass_is_that_of_a_normal_from_few_particles(particles: int, conditi
     """Its covariance alone would leave a condition number of about 200 with 40 particles in 30 axes."""
     torch.manual_seed(0)
     covariance = uneven(30)
-    draws = equal_weights(simulate(normal(covariance), (), particles))
+    draws = Population(simulate(normal(covariance), (), particles))
     factor = learned_factor(("x",), draws, POSTERIOR)
     # The covariance in the coordinates in which the mass is 1.
     white = torch.linalg.solve_triangular(factor, torch.linalg.cholesky(covariance), upper=False)
@@ -163,9 +163,9 @@ def test_it_is_accepted_as_often_as_wanted_and_turns_by_about_a_quarter(dimensio
     for wanted in (0.6, 0.9):
         learned, others = (simulate(program, (), 400) for _ in range(2))
         kernel = adaptive_hmc("x", acceptance=wanted, jitter=0.0)
-        moved, accepted = kernel(equal_weights(learned))(others, POSTERIOR)
+        moved, accepted = kernel(Population(learned))(others, POSTERIOR)
         assert float(accepted.mean()) == pytest.approx(wanted, abs=0.2)
-        factor = learned_factor(("x",), equal_weights(learned), POSTERIOR)
+        factor = learned_factor(("x",), Population(learned), POSTERIOR)
         size, steps, *_ = tuned(learned, ("x",), POSTERIOR, factor, acceptance=wanted, most_steps=32)
         assert 0.7 < size * steps < 2.2
         both = [torch.linalg.solve_triangular(factor, t["x"].T, upper=False) for t in (others, moved)]
@@ -183,7 +183,7 @@ def test_mutant_whose_criterion_lets_trajectories_turn_by_a_half(monkeypatch: py
         room._Flight, "flown", lambda *args: [(chance, far, far) for chance, far, _ in sound(*args)]
     )
     learned = simulate(normal(uneven(50)), (), 400)
-    factor = learned_factor(("x",), equal_weights(learned), POSTERIOR)
+    factor = learned_factor(("x",), Population(learned), POSTERIOR)
     size, steps, *_ = tuned(learned, ("x",), POSTERIOR, factor, acceptance=0.95, most_steps=32)
     assert size * steps > 2.0
 
@@ -207,7 +207,7 @@ def test_chains_warm_up_from_where_they_should_not_begin() -> None:
 def test_a_population_is_rejuvenated() -> None:
     torch.manual_seed(0)
     trace = correlated_draws(4000)
-    moved = rejuvenate(equal_weights(trace), adaptive_hmc("x"), sweeps=2)
+    moved = rejuvenate(Population(trace), adaptive_hmc("x"), sweeps=2)
     assert largest_z(moments(trace, "x"), moments(moved.trace, "x")) < SOUND
     assert math.isclose(moved.log_evidence, 0.0)
 

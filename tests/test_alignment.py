@@ -22,13 +22,14 @@ from bcppl.geometry.camera import Camera, looking_at
 from bcppl.geometry.distance import SignedDistance
 from bcppl.geometry.parts import Part
 from bcppl.inference.kernels import metropolis_hastings
+from bcppl.inference.population import Population
 from bcppl.inference.proposals import contact_alignment, depth_alignment, program_of
 from bcppl.inference.proposals.proposal import Proposal
 from bcppl.inference.targets import POSTERIOR
 from bcppl.poses import Freedom
 from bcppl.rendering.ray_casting import RayCaster
 from bcppl.traces import Proposed, Trace, assess, propose, simulate
-from tests.invariance import equal_weights, largest_z
+from tests.invariance import largest_z
 
 DRAWS = 2000
 SOUND, BROKEN = 4.5, 8.0  # |z| of the worst of a few dozen expectations: below if invariant, above if not
@@ -77,7 +78,7 @@ def worst_z(
 ) -> float:
     """The largest |z| of the change in expectations over exact draws of a pose with its own image."""
     torch.manual_seed(1)
-    move = metropolis_hastings(proposal)(equal_weights(simulate(program, (), 60)))
+    move = metropolis_hastings(proposal)(Population(simulate(program, (), 60)))
     trace = simulate(program, (), DRAWS)
     before = functions(trace)
     for _ in range(times):
@@ -134,7 +135,7 @@ def test_a_way_there_has_the_density_that_assess_gives_it(case: str) -> None:
     torch.manual_seed(0)
     model, steps = DEPTH_CASES[case]
     trace = simulate(model, (), 40)
-    program = program_of(depth_alignment("part", steps=steps), (), equal_weights(trace))
+    program = program_of(depth_alignment("part", steps=steps), (), Population(trace))
     there = propose(program, (trace,), 40)
     torch.testing.assert_close(assess(program, (trace,), there.choices, 40), there.log_prob)
     back = assess(program, (trace.at(there.choices),), {"part": trace["part"]}, 40)
@@ -154,7 +155,7 @@ def test_depth_alignment_finds_the_part() -> None:
         return float(apart.norm(dim=-1).mean(dim=-1).median())
 
     begun = off(trace)
-    move = metropolis_hastings(depth_alignment("part"))(equal_weights(trace))
+    move = metropolis_hastings(depth_alignment("part"))(Population(trace))
     for _ in range(6):
         trace, _ = move(trace, POSTERIOR)
     assert off(trace) < 0.4 * begun
@@ -173,7 +174,7 @@ def test_depth_alignment_refuses_what_is_no_image_of_the_part() -> None:
         ("felt", "no depth image"),
         ("touch_*", "match no address"),
     ):
-        program = program_of(depth_alignment("part", sites), (), equal_weights(trace))
+        program = program_of(depth_alignment("part", sites), (), Population(trace))
         with pytest.raises(InputError, match=message):
             propose(program, (trace,), 3)
     with pytest.raises(InputError, match="steps"):
@@ -256,7 +257,7 @@ def test_contact_alignment_brings_the_part_to_what_was_felt(
     program = CONTACT_CASES[case]
     trace = simulate(program, (), 300)
     off = trace.at({"part": simulate(program, (), 300)["part"]})
-    step = program_of(contact_alignment("part"), (), equal_weights(off))
+    step = program_of(contact_alignment("part"), (), Population(off))
     there = off.at({"part": propose(step, (off,), 300).choices["part"]})
     best, begun, reached = (float(of_touch(each)[:, -2].median()) for each in (trace, off, there))
     assert reached > begun + gain * (best - begun)
@@ -266,7 +267,7 @@ def test_contact_alignment_brings_the_part_to_what_was_felt(
 def test_contact_alignment_is_assessed_as_it_is_proposed(case: str) -> None:
     torch.manual_seed(0)
     trace = simulate(CONTACT_CASES[case], (), 40)
-    program = program_of(contact_alignment("part"), (), equal_weights(trace))
+    program = program_of(contact_alignment("part"), (), Population(trace))
     there = propose(program, (trace,), 40)
     torch.testing.assert_close(assess(program, (trace,), there.choices, 40), there.log_prob)
     back = assess(program, (trace.at(there.choices),), {"part": trace["part"]}, 40)
@@ -276,7 +277,7 @@ def test_contact_alignment_is_assessed_as_it_is_proposed(case: str) -> None:
 def test_contact_alignment_refuses_what_was_not_felt_of_the_part() -> None:
     trace = simulate(seen, (), 3)
     for sites, message in ((("depth_*",), "is a RobustDepth"), (("touch_*",), "match no address")):
-        program = program_of(contact_alignment("part", sites), (), equal_weights(trace))
+        program = program_of(contact_alignment("part", sites), (), Population(trace))
         with pytest.raises(InputError, match=message):
             propose(program, (trace,), 3)
     with pytest.raises(InputError, match="reach"):

@@ -179,7 +179,7 @@ def elsewhere() -> None:
 
 def other_addresses() -> Any:
     trace, _ = generate(elsewhere, (), {}, 50)
-    return to_arviz([weighted(50, 1), Population(trace, torch.zeros(50, dtype=torch.float64))])
+    return to_arviz([weighted(50, 1), Population(trace)])
 
 
 def other_observations() -> Any:

@@ -15,11 +15,12 @@ from bcppl.errors import InputError
 from bcppl.inference import tempered, tempered_importance_sampling
 from bcppl.inference.kernels import delayed_acceptance, metropolis_hastings, repeat, sequence
 from bcppl.inference.learning import bridged, bridging
+from bcppl.inference.population import Population
 from bcppl.inference.proposals import drift
 from bcppl.inference.summaries import covariance, mean
 from bcppl.inference.targets import POSTERIOR
 from bcppl.traces import Trace, generate, simulate
-from tests.invariance import equal_weights, largest_z, number
+from tests.invariance import largest_z, number
 
 # x ~ N(0, I) in 4 axes, y | x ~ N(x, 0.1^2): the posterior is N(y / 1.01, 0.01 / 1.01).
 SEEN = {"y": torch.tensor([0.5, -1.0, 0.2, 1.5], dtype=torch.float64)}
@@ -122,7 +123,7 @@ def functions(trace: Trace) -> Tensor:
 def test_targets_between_are_left_invariant_and_other_ones_are_not() -> None:
     torch.manual_seed(0)
     target, draws = bridge(0.3)
-    move = repeat(metropolis_hastings(drift("x")), 3)(equal_weights(draws[:500]))
+    move = repeat(metropolis_hastings(drift("x")), 3)(Population(draws[:500]))
     assert largest_z(functions(draws), functions(move(draws, target)[0])) < 4.5
     wrong, _ = bridge(0.7)
     for other in (POSTERIOR, wrong):

@@ -17,13 +17,14 @@ from bcppl.errors import InputError
 from bcppl.inference.filters.tempered_smc import infer
 from bcppl.inference.kernels import metropolis_hastings
 from bcppl.inference.kernels.kernel import takes
+from bcppl.inference.population import Population
 from bcppl.inference.proposals import spread_of
 from bcppl.inference.targets import Target
 from bcppl.models import camera_error
 from bcppl.models.worlds.two_cameras import WorldParameters, simulate_recording
 from bcppl.sensors.measurements import Recording
 from bcppl.traces import Trace, generate
-from tests.invariance import equal_weights, largest_z
+from tests.invariance import largest_z
 
 SOUND = 4.5  # |z| of the worst of a few dozen expectations, as in the tests of other proposals
 # Without images the prior of all poses is the target, and draws of it are exact.
@@ -62,7 +63,7 @@ def expectations(trace: Trace) -> Tensor:
 @pytest.mark.parametrize("proposal", camera_error.model.proposals)
 def test_proposals_leave_the_target_invariant(recording: Recording, proposal: Callable[..., None]) -> None:
     torch.manual_seed(2)
-    teachers = equal_weights(draws(recording, 40))
+    teachers = Population(draws(recording, 40))
     learned = [lambda p: {f"seen_by_{n}": 0.02 * spread_of(f"seen_by_{n}")(p) for n in INSTRUMENTS}]
     move = metropolis_hastings(proposal, *(learned if takes(proposal, 2) else []))(teachers)
     before = after = draws(recording, 5_000)

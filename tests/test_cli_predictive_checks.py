@@ -21,8 +21,8 @@ from bcppl.cli.predictive_checks import (
     sentence,
     together,
 )
+from bcppl.distributions.checks import Check
 from bcppl.geometry.parts import Piece
-from bcppl.inference.criticism.predictive import Check
 from bcppl.models.worlds.bench.parameters import BenchParameters
 from bcppl.models.worlds.bench.scene import bench_scene
 from bcppl.recordings import save

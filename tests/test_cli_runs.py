@@ -28,7 +28,7 @@ def test_a_users_own_files_are_taken_as_readily_as_names(bcppl: Callable[..., Ra
     )
     (tmp_path / "my_probe.py").write_text(mine.replace("program=point_probe", "program=my_probe"))
     (tmp_path / "my_smc.py").write_text(
-        "from bcppl.inference.filters.smc import smc, tempered\n"
+        "from bcppl.inference import smc, tempered\n"
         "def infer(model, recording, *, particles, seed, scene):\n"
         "    options = {'particles': particles, 'seed': seed, 'scene': scene}\n"
         "    yield from smc(model, recording, step=tempered(), **options)\n"

@@ -33,7 +33,7 @@ from bcppl.inference.proposals import drift
 from bcppl.inference.targets import POSTERIOR, Target
 from bcppl.poses import Freedom, identity
 from bcppl.traces import Trace, simulate
-from tests.invariance import equal_weights, largest_z
+from tests.invariance import largest_z
 
 DRAWS = 20_000
 SOUND, BROKEN = 4.5, 8.0  # |z| of the worst expectation: below if invariant, above if not
@@ -62,7 +62,7 @@ def worst_z(kernel: Kernel, times: int = 2) -> float:
         return torch.stack([x, x**2, x.log(), (x > 2.0).double()], dim=1)
 
     before = functions(trace)
-    move = kernel(equal_weights(trace[:500]))
+    move = kernel(Population(trace[:500]))
     for _ in range(times):
         trace, _ = move(trace, POSTERIOR)
     return largest_z(before, functions(trace))
@@ -119,7 +119,7 @@ def adding(step: float, share: float, seen: list[Tensor]) -> Kernel:
 def moves_of(kernel: Kernel, count: int = 4000) -> tuple[Tensor, Tensor]:
     torch.manual_seed(0)
     trace = simulate(lopsided, (), count)
-    moved, accepted = kernel(equal_weights(trace))(trace, POSTERIOR)
+    moved, accepted = kernel(Population(trace))(trace, POSTERIOR)
     return moved["x"] - trace["x"], accepted
 
 
@@ -129,7 +129,7 @@ def test_sequence_keeps_its_order_and_cycle_draws_one_for_each_move() -> None:
     def orders(combine: Callable[..., Kernel]) -> set[tuple[float, ...]]:
         found = set()
         seen: list[Tensor] = []
-        move = combine(*[adding(step, 1.0, seen) for step in (1.0, 10.0, 100.0)])(equal_weights(trace))
+        move = combine(*[adding(step, 1.0, seen) for step in (1.0, 10.0, 100.0)])(Population(trace))
         for _ in range(60):
             seen.clear()
             last = move(trace, POSTERIOR)[0]["x"]
@@ -190,7 +190,7 @@ def test_what_cannot_be_is_refused(make: Callable[[], object], says: str) -> Non
 
 def copies(count: int, ancestors: int) -> Population:
     trace = simulate(lopsided, (), ancestors)
-    return equal_weights(trace[torch.arange(count) % ancestors])
+    return Population(trace[torch.arange(count) % ancestors])
 
 
 def counted(kernel: Kernel) -> tuple[Kernel, list[int]]:
@@ -243,7 +243,7 @@ def test_displacement_is_asked_for_on_every_free_axis() -> None:
     trace = simulate(program, (), 500)
     shifted = trace["pose"].clone()
     shifted[:, 1] += 0.2 * torch.randn(500, dtype=torch.float64)
-    share = displacement(equal_weights(trace), equal_weights(trace.at({"pose": shifted})))
+    share = displacement(Population(trace), Population(trace.at({"pose": shifted})))
     assert share.shape == (3,)
     assert float(share[0]) == 0.0
     assert float(share[2]) == pytest.approx(0.0, abs=1e-12)
@@ -261,7 +261,7 @@ def particle_by_particle(population: Population, kernel: Kernel) -> Population:
         going = ((trace["x"] - population.trace["x"]).abs() < 1.0).nonzero().flatten()
         if len(going) == 0:
             break
-    return equal_weights(trace)
+    return Population(trace)
 
 
 def test_stopping_together_leaves_no_bias_that_shows_and_each_alone_does() -> None:
@@ -269,7 +269,7 @@ def test_stopping_together_leaves_no_bias_that_shows_and_each_alone_does() -> No
     torch.manual_seed(6)
     together, alone = [], []
     for _ in range(40):
-        population = equal_weights(simulate(lopsided, (), 75))
+        population = Population(simulate(lopsided, (), 75))
         done = moved_by(population, SHORT, POSTERIOR, until(displacement=0.5)).population
         together.append(done.trace["x"].mean() - 2.0)
         alone.append(particle_by_particle(population, SHORT).trace["x"].mean() - 2.0)

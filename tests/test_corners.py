@@ -63,7 +63,7 @@ def test_at_exponent_zero_the_proposals_ratio_still_decides() -> None:
     def leaning(_: Trace) -> None:
         pyro.sample("x", dist.Beta(number(3.0), number(1.0)))
 
-    start = Population(trace, torch.zeros(8000, dtype=torch.float64))
+    start = Population(trace)
     moved = moved_by(start, metropolis_hastings(leaning), Target({"x": 0.0}), 3).population
     assert float(moved.trace["x"].mean()) == pytest.approx(0.5, abs=4.5 * 0.29 / math.sqrt(8000))
 

@@ -77,10 +77,6 @@ def exact(count: int, exponent: float = 1.0) -> Trace:
     return trace.at({"x": mean + torch.randn(count, dtype=torch.float64) / math.sqrt(precision)})
 
 
-def equal_weights(trace: Trace) -> Population:
-    return Population(trace, torch.zeros(len(trace), dtype=torch.float64))
-
-
 def leaning(trace: Trace) -> None:
     """Not symmetric: the reverse move has another density."""
     pyro.sample("x", dist.Normal(0.6 * trace["x"] + 0.1, 0.5))
@@ -88,7 +84,7 @@ def leaning(trace: Trace) -> None:
 
 def worst_z(kernel: Kernel, target: Target = POSTERIOR, exponent: float = 1.0, times: int = 2) -> float:
     torch.manual_seed(1)
-    move = kernel(equal_weights(exact(500)))
+    move = kernel(Population(exact(500)))
     trace = exact(DRAWS, exponent)
 
     def functions(trace: Trace) -> Tensor:
@@ -214,7 +210,7 @@ def test_mutants_of_transitions(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_stages_run_in_order_and_late_sites_for_survivors_only() -> None:
     torch.manual_seed(0)
     trace = exact(2000)
-    move = delayed_acceptance(LEANING, first="depth_*", stages=3)(equal_weights(trace))
+    move = delayed_acceptance(LEANING, first="depth_*", stages=3)(Population(trace))
     POSTERIOR(trace)
     Seen.asked.clear()
     moved, accepted = move(trace, POSTERIOR)
@@ -233,7 +229,7 @@ def test_a_surrogate_decides_before_any_site() -> None:
     walk = metropolis_hastings(drift("x", (3.0, 4.0)))
     POSTERIOR(trace)
     Seen.asked.clear()
-    delayed_acceptance(walk, surrogate=student_t("x"))(equal_weights(trace))(trace, POSTERIOR)
+    delayed_acceptance(walk, surrogate=student_t("x"))(Population(trace))(trace, POSTERIOR)
     assert [name for name, _ in Seen.asked] == ["depth_1", "touch_0", "touch_2"]
     assert 0 < max(count for _, count in Seen.asked) < 1000
 
@@ -244,7 +240,7 @@ def test_a_transition_asks_each_costly_site_once_for_those_that_moved() -> None:
     POSTERIOR(trace)
     Seen.asked.clear()
     surrogate = lambda _: lambda each: each.log_prob("x", "depth_1")  # noqa: E731
-    moved, accepted = surrogate_transition(repeat(WALK, 5), surrogate)(equal_weights(trace))(trace, POSTERIOR)
+    moved, accepted = surrogate_transition(repeat(WALK, 5), surrogate)(Population(trace))(trace, POSTERIOR)
     asked = [each for each in Seen.asked if each[0] != "depth_1"]
     assert [name for name, _ in asked] == ["touch_0", "touch_2"]
     assert int(accepted.sum()) < asked[1][1] < asked[0][1] < 2000
@@ -272,7 +268,7 @@ def test_an_order_that_reads_the_same_backwards_is_reversible() -> None:
 
 def test_sites_that_count_for_nothing_are_not_asked() -> None:
     trace = exact(50)
-    move = delayed_acceptance(LEANING, stages=3)(equal_weights(trace))
+    move = delayed_acceptance(LEANING, stages=3)(Population(trace))
     Seen.asked.clear()
     move(trace, Target({"touch_0": 0.0}))
     assert {name for name, _ in Seen.asked} == {"depth_1", "touch_2"}
@@ -299,7 +295,7 @@ def looking(site: str) -> Callable[[Trace], None]:
 
 def test_a_way_back_that_reads_a_later_stage_is_refused() -> None:
     trace = exact(50)
-    population = equal_weights(trace)
+    population = Population(trace)
     touch, depth = metropolis_hastings(looking("touch_0")), metropolis_hastings(looking("depth_1"))
     for kernel in (delayed_acceptance(touch), delayed_acceptance(touch, surrogate=student_t("x"))):
         with pytest.raises(InputError, match="touch_0"):
@@ -321,4 +317,4 @@ def test_what_cannot_be_is_refused() -> None:
         with pytest.raises(InputError, match=message):
             make()
     with pytest.raises(InputError, match=r"'image_\*', which fits no address; .*depth_1"):
-        delayed_acceptance(WALK, "image_*")(equal_weights(trace))(trace, POSTERIOR)
+        delayed_acceptance(WALK, "image_*")(Population(trace))(trace, POSTERIOR)

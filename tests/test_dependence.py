@@ -102,7 +102,7 @@ def test_regenerate_weighs_what_a_closure_depends_on(program: Program, kind: str
 def test_metropolis_hastings_leaves_no_stale_density(program: Program, kind: str, address: str) -> None:
     """Some particles accept, others refuse: the trace's density is that of its values."""
     trace = made(program, kind)
-    population = Population(trace, torch.zeros(N, dtype=torch.float64))
+    population = Population(trace)
     torch.manual_seed(2)
     moved, accepted = metropolis_hastings(drift(address, (0.2, 0.4)))(population)(trace, POSTERIOR)
     assert 0 < int(accepted.sum()) < N, "the test has to see both"
@@ -118,7 +118,7 @@ def test_metropolis_hastings_finds_the_posterior(program: Program, kind: str) ->
     """Of the shift given x, a normal that is known."""
     count = 200
     trace = made(program, kind, count)
-    population = Population(trace, torch.zeros(count, dtype=torch.float64))
+    population = Population(trace)
     torch.manual_seed(3)
     moved = moved_by(population, metropolis_hastings(drift("shift", (0.05, 1.0))), POSTERIOR, 40)
     found, precision = moved.population.trace, 1.0 + SCALE**-2

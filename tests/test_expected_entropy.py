@@ -24,7 +24,7 @@ from bcppl.inference.design import (
 )
 from bcppl.inference.population import Population
 from bcppl.traces import generate, simulate
-from tests.invariance import equal_weights, matrix
+from tests.invariance import matrix
 
 # A measurement reads x by a table of probabilities, a row for each state.
 
@@ -207,7 +207,7 @@ def linear(scales: list[Tensor]) -> None:
 @pytest.mark.parametrize("measure", ["modes", "neighbours"])
 def test_a_linear_gaussian_program_has_the_closed_form(measure: str) -> None:
     torch.manual_seed(4)
-    population = equal_weights(simulate(linear, ([],), 3000))
+    population = Population(simulate(linear, ([],), 3000))
     rows = [matrix([1.0, 0.0]), matrix([0.0, 1.0]), matrix([0.6, 0.8])]
     kind = mixture_entropy("x") if measure == "modes" else neighbour_entropy("x", 5)
     ranking = expected_information_gain(

@@ -21,7 +21,6 @@ from bcppl.inference.proposals import Fitted, drift, independent
 from bcppl.inference.resampling import systematic
 from bcppl.inference.targets import POSTERIOR
 from bcppl.traces import Trace, simulate
-from tests.invariance import equal_weights
 
 AXES = 20
 
@@ -32,7 +31,7 @@ def gaussian() -> None:
 
 def with_copies(draws: int, copies: int) -> Population:
     """Exact draws, each of them several times."""
-    return equal_weights(simulate(gaussian, (), draws)[torch.arange(draws * copies) % draws])
+    return Population(simulate(gaussian, (), draws)[torch.arange(draws * copies) % draws])
 
 
 def families_apart(population: Population) -> bool:
@@ -215,7 +214,7 @@ def test_equal_discrete_values_are_no_copies() -> None:
     torch.manual_seed(0)
     changes = []
     for _ in range(200):
-        population = halved(equal_weights(simulate(coins, (), 40)))
+        population = halved(Population(simulate(coins, (), 40)))
         assert abs(int(population.sides.sum()) - 20) <= 1
         moved_coins = moved_by(population, metropolis_hastings(Fitted(fit)), POSTERIOR, 1).population["coin"]
         changes.append((moved_coins - population["coin"]).double().mean())

@@ -18,10 +18,11 @@ from bcppl.distributions.poses import NormalPose
 from bcppl.errors import InputError
 from bcppl.inference.kernels import delayed_acceptance, fitted, hamiltonian, hmc, moved_by
 from bcppl.inference.kernels.kernel import Kernel
+from bcppl.inference.population import Population
 from bcppl.inference.targets import POSTERIOR, Target
 from bcppl.traces import Trace, carried, generate, simulate
 from bcppl.traces.differentiation.programs import log_prob_with_grad
-from tests.invariance import equal_weights, largest_z, number
+from tests.invariance import largest_z, number
 
 DRAWS = 10_000
 SOUND, BROKEN = 4.5, 8.0
@@ -92,7 +93,7 @@ def worst_z(case: str, kernel: Kernel | None = None, target: Any = POSTERIOR, ti
     exact, addresses, size = CASES[case]
     torch.manual_seed(1)
     kernel = hmc(*addresses, step_size=size, steps=4) if kernel is None else kernel
-    move = kernel(equal_weights(exact(500)))
+    move = kernel(Population(exact(500)))
     trace = exact(DRAWS)
     functions = flattened(*addresses)
     before = functions(trace)
@@ -151,7 +152,7 @@ def test_mutant_that_climbs_the_wrong_way_is_rejected(monkeypatch: pytest.Monkey
     def accepted() -> float:
         torch.manual_seed(0)
         trace = posterior_draws(1.0)(1000)
-        _, done = hmc("x", step_size=0.5, steps=8)(equal_weights(trace))(trace, POSTERIOR)
+        _, done = hmc("x", step_size=0.5, steps=8)(Population(trace))(trace, POSTERIOR)
         return float(done.mean())
 
     assert accepted() > 0.85
@@ -200,7 +201,7 @@ def test_gaussian_chain() -> None:
     trace, _ = generate(chain, (), {"y": number(1.0)}, count)
     names = ("z_1", "z_2", "z_3")
     away = trace.at({a: 3.0 + 2.0 * trace[a] for a in names})
-    done = moved_by(equal_weights(away), hmc(*names), POSTERIOR, 12)
+    done = moved_by(Population(away), hmc(*names), POSTERIOR, 12)
     assert done.acceptance > 0.8
     x = torch.stack([done.population.trace[a] for a in names], dim=1)
     variance = vector(0.75, 1.0, 0.75)
@@ -218,7 +219,7 @@ def wide() -> None:
 def still_on_its_line(kernel: Kernel, seed: int) -> float:
     """The share of particles that three sweeps leave near the line through the mean on which they began."""
     torch.manual_seed(seed)
-    start = equal_weights(simulate(wide, (), 2000))
+    start = Population(simulate(wide, (), 2000))
     moved = moved_by(start, kernel, POSTERIOR, 3).population
     return float((torch.cosine_similarity(start["x"], moved["x"], dim=1).abs() > 0.8).double().mean())
 
@@ -232,7 +233,7 @@ def test_few_particles_stay_on_their_line_through_the_mean() -> None:
 def test_each_move_draws_its_number_of_steps() -> None:
     """Of what has learned once too: its small steps go three times or eight times as far."""
     torch.manual_seed(0)
-    start = equal_weights(simulate(wide, (), 200))
+    start = Population(simulate(wide, (), 200))
     move = fitted(hmc("x", step_size=1e-3, jitter=0.0), start)
     ends = [move(start.trace, POSTERIOR)[0]["x"] for _ in range(12)]
     lengths = {round(float((x - start["x"]).norm(dim=1).mean()) / 1e-3 / 40**0.5) for x in ends}
@@ -245,7 +246,7 @@ def test_units_do_not_matter() -> None:
 
     torch.manual_seed(0)
     trace = simulate(uneven, (), 1000)
-    moved, accepted = hmc("x")(equal_weights(trace))(trace, POSTERIOR)
+    moved, accepted = hmc("x")(Population(trace))(trace, POSTERIOR)
     assert float(accepted.mean()) > 0.85
     assert bool(((moved["x"] - trace["x"]).std(0) > vector(1e-4, 1e3)).all())
 
@@ -272,7 +273,7 @@ def test_trajectories_that_diverge_are_rejected() -> None:
 
     torch.manual_seed(0)
     trace = simulate(steep, (), 500)
-    moved, accepted = hmc("s", step_size=60.0, steps=30)(equal_weights(trace))(trace, POSTERIOR)
+    moved, accepted = hmc("s", step_size=60.0, steps=30)(Population(trace))(trace, POSTERIOR)
     assert float(accepted.mean()) < 0.1
     assert bool(torch.isfinite(moved.log_prob()).all())
 
@@ -330,10 +331,10 @@ def test_what_has_no_gradient_is_refused_by_name() -> None:
         given = {} if observed is None else {observed: number(0.3)}
         trace, _ = generate(mixed, (kind,), given, 20)
         with pytest.raises(InputError, match=match) as caught:
-            hmc(*addresses)(equal_weights(trace))(trace, POSTERIOR)
+            hmc(*addresses)(Population(trace))(trace, POSTERIOR)
         assert "\n" not in str(caught.value)
         # An address that no simulator depends on moves, also beside one.
-        free, _ = hmc("matrix")(equal_weights(trace))(trace, POSTERIOR)
+        free, _ = hmc("matrix")(Population(trace))(trace, POSTERIOR)
         assert not torch.equal(free["matrix"], trace["matrix"])
 
     refused("physics", r"'felt' depends on 'x' and runs a simulator", "z", "x")

@@ -66,7 +66,7 @@ def belief(
     trace, _ = generate(program, (), {"depth": seen()}, COUNT)
     spread = torch.tensor([1e-4] * 3 + [1e-3] * 3, dtype=torch.float64)
     drawn = NormalPose(middle, spread).expand((COUNT,)).sample()
-    return Population(trace.at({"part": drawn}), torch.zeros(COUNT, dtype=torch.float64))
+    return Population(trace.at({"part": drawn}))
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])

@@ -18,10 +18,11 @@ from bcppl.errors import InputError
 from bcppl.inference.kernels import involutions, involutive
 from bcppl.inference.kernels.jacobian import Charted, Real, Simplex, Tangent, log_abs_det_jacobian
 from bcppl.inference.kernels.kernel import Kernel
+from bcppl.inference.population import Population
 from bcppl.inference.targets import POSTERIOR
 from bcppl.poses import FREE, Freedom
 from bcppl.traces import Trace, simulate
-from tests.invariance import equal_weights, largest_z, number
+from tests.invariance import largest_z, number
 
 DRAWS = 10_000
 SOUND, BROKEN = 4.5, 8.0
@@ -181,7 +182,7 @@ def worst_z(program: Any, kernel: Kernel, functions: Any, target: Any = POSTERIO
     """The largest |z| of the change in expectations from exact draws, each draw compared with itself."""
     torch.manual_seed(1)
     trace = simulate(program, (), DRAWS)
-    move = kernel(equal_weights(trace[:100]))
+    move = kernel(Population(trace[:100]))
     before = functions(trace)
     for _ in range(times):
         trace, accepted = move(trace, target)
@@ -293,7 +294,7 @@ def test_maps_that_are_refused_name_the_address() -> None:
     def once(program: Any, auxiliary: Any, involution: Any, check: bool = False) -> None:
         torch.manual_seed(0)
         trace = simulate(program, (), 6)
-        involutive(auxiliary, involution, check=check)(equal_weights(trace))(trace, POSTERIOR)
+        involutive(auxiliary, involution, check=check)(Population(trace))(trace, POSTERIOR)
 
     def refused(match: str, *args: Any, **kwargs: Any) -> None:
         with pytest.raises(InputError, match=match) as caught:

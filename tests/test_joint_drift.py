@@ -12,13 +12,14 @@ from bcppl import poses
 from bcppl.distributions.poses import NormalPose
 from bcppl.errors import InputError
 from bcppl.inference.kernels import metropolis_hastings
+from bcppl.inference.population import Population
 from bcppl.inference.proposals import Proposal, drift
 from bcppl.inference.proposals.coordinates import continuous_addresses
 from bcppl.inference.proposals.walk import joint_drift
 from bcppl.inference.targets import POSTERIOR
 from bcppl.traces import Trace, simulate
 from tests.exact_targets import CENTER
-from tests.invariance import equal_weights, largest_z, matrix, number
+from tests.invariance import largest_z, matrix, number
 
 DRAWS = 7_000
 SOUND, BROKEN = 4.5, 8.0  # as in the tests of other proposals
@@ -43,7 +44,7 @@ def of(trace: Trace) -> Tensor:
 def moved(proposal: Proposal, times: int = 2) -> tuple[Trace, Trace, float]:
     """Exact draws before and after some moves that were fitted to draws of their own, and the acceptance."""
     torch.manual_seed(3)
-    move = metropolis_hastings(proposal)(equal_weights(simulate(ridge, (), 60)))
+    move = metropolis_hastings(proposal)(Population(simulate(ridge, (), 60)))
     before = after = simulate(ridge, (), DRAWS)
     shares = []
     for _ in range(times):
@@ -81,7 +82,7 @@ def test_discrete_values_are_not_moved() -> None:
     trace = simulate(ridge, (), 5)
     assert continuous_addresses(trace) == ["pose", "size", "seen"]
     with pytest.raises(InputError, match="which"):
-        joint_drift("pose", "which").fit(equal_weights(trace))
+        joint_drift("pose", "which").fit(Population(trace))
 
 
 @pytest.mark.parametrize("addresses", [(), ("pose",), ("pose", "pose")])

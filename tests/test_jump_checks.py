@@ -13,10 +13,11 @@ from torch import Tensor
 
 from bcppl.errors import InputError
 from bcppl.inference.filters.smcp3 import Pair, moved
+from bcppl.inference.population import Population
 from bcppl.inference.structures import Jump, Strata, generate_strata, jump, probabilities, resample_strata
 from bcppl.inference.targets import POSTERIOR
 from bcppl.traces import Structure, Trace, generate, structural
-from tests.invariance import equal_weights, number
+from tests.invariance import number
 
 Given = tuple[dict[str, Tensor], dict[str, Tensor]]
 
@@ -91,7 +92,7 @@ def test_a_check_of_a_pair_sees_a_value_that_is_detached_in_part() -> None:
         return {"x": 0.6 * x + sign * 0.8 * (z.detach() if cut else z), "z": 0.6 * z - sign * 0.8 * x}, {}
 
     torch.manual_seed(0)
-    population = equal_weights(generate(program, (), {}, 20)[0])
+    population = Population(generate(program, (), {}, 20)[0])
     back = partial(turned, sign=-1.0, cut=False)
     whole = moved(population, Pair(partial(turned, sign=1.0, cut=False), back, check=True))
     torch.testing.assert_close(whole.trace.log_prob(), population.trace.log_prob())

@@ -36,7 +36,7 @@ from tests.exact_targets import (
     planar,
     wide,
 )
-from tests.invariance import equal_weights, largest_z, number
+from tests.invariance import largest_z, number
 
 DRAWS = 20_000
 SOUND, BROKEN = 4.5, 8.0  # |z| of the worst of a dozen expectations: below if invariant, above if not
@@ -71,7 +71,7 @@ def worst_z(
     standard error is what it is measured in.
     """
     torch.manual_seed(1)
-    move = kernel(equal_weights(exact(500)))
+    move = kernel(Population(exact(500)))
     trace = exact(DRAWS)
     before = functions(trace[address])
     for _ in range(times):
@@ -175,7 +175,7 @@ def test_a_proposal_that_moves_nothing_latent_is_refused() -> None:
 
     trace = correlated_draws(4)
     with pytest.raises(InputError, match=r"elsewhere.* latent are x"):
-        metropolis_hastings(elsewhere)(equal_weights(trace))(trace, POSTERIOR)
+        metropolis_hastings(elsewhere)(Population(trace))(trace, POSTERIOR)
 
 
 def test_drift_moves_scalars_and_matrices_too() -> None:
@@ -216,7 +216,7 @@ def test_no_particle_shapes_its_own_proposal(count: int) -> None:
     trace = simulate(program, (), count)
     tags = set(trace["tag"].tolist())
     sweeps = 3
-    done = moved_by(equal_weights(trace), metropolis_hastings(Fitted(spying)), POSTERIOR, sweeps)
+    done = moved_by(Population(trace), metropolis_hastings(Fitted(spying)), POSTERIOR, sweeps)
     assert len(learnt) == len(moved) == 2 * sweeps
     for others, mine in zip(learnt, moved, strict=True):
         assert not others & mine and others | mine == tags
@@ -232,7 +232,7 @@ def test_no_particle_shapes_its_own_proposal(count: int) -> None:
 def test_acceptance_is_the_share_that_moved() -> None:
     torch.manual_seed(0)
     trace = correlated_draws(1000)
-    done = moved_by(equal_weights(trace), metropolis_hastings(drift("x")), POSTERIOR)
+    done = moved_by(Population(trace), metropolis_hastings(drift("x")), POSTERIOR)
     moved = (done.population.trace["x"] != trace["x"]).any(dim=-1)
     assert done.acceptance == pytest.approx(float(moved.double().mean()))
     assert 0.05 < done.acceptance < 0.95

@@ -77,7 +77,7 @@ def drawn(count: int, seed: int = 0, centers: Tensor | None = None) -> Populatio
     if centers is not None:
         tangent = tangent + centers.repeat(count // len(centers), 1)
     trace, _ = generate(readings, (SPREADS, []), {}, count, choices={"part": poses.retract(CENTER, tangent)})
-    return Population(trace, torch.zeros(count, dtype=torch.float64))
+    return Population(trace)
 
 
 def arguments(one: Reading) -> tuple[Tensor, list[Reading]]:
@@ -245,7 +245,7 @@ def test_touches_that_meet_the_part_inform_its_height() -> None:
 
     torch.manual_seed(0)
     trace, _ = generate(touching, ([],), {}, 60)
-    population = Population(trace, torch.zeros(60, dtype=torch.float64))
+    population = Population(trace)
     plans = [touch(0.0, 0.008), touch(0.2, 0.008), touch(0.0, -0.02), touch(0.015, 0.008), touch(0.0, 0.0)]
     ranking = linearised_information_gain(population, plans, lambda plan: ([action_of(plan)],), seed=0)
     gain = [ranking.of(k).information_gain for k in range(5)]

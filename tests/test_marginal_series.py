@@ -14,6 +14,7 @@ from torch import Tensor
 from bcppl.errors import InputError
 from bcppl.inference import Observed, importance_sampling, markov_chains, steps, tempered
 from bcppl.inference.kernels import hmc, metropolis_hastings
+from bcppl.inference.population import Population
 from bcppl.inference.proposals import drift
 from bcppl.inference.resampling import adaptive, always, never, systematic
 from bcppl.inference.series import marginal
@@ -22,7 +23,7 @@ from bcppl.inference.summaries import mean
 from bcppl.inference.targets import POSTERIOR
 from bcppl.traces import Series, Trace, assess, extend, generate, gradients, simulate, update
 from bcppl.traces.carried import carried
-from tests.invariance import equal_weights, number
+from tests.invariance import number
 from tests.linear_series import AUTOREGRESSION, SEEN, log_evidence, observed, posterior, step
 
 T = 8
@@ -108,7 +109,7 @@ def chains_of(reestimated: bool, count: int, moves: int) -> Tensor:
     grid, chance, _ = posterior(T)
     rho = grid[torch.multinomial(chance, count, replacement=True)]
     trace, _ = generate(program, STEPS, observed(T), count, {"rho": rho})
-    move = metropolis_hastings(nudge)(equal_weights(trace))
+    move = metropolis_hastings(nudge)(Population(trace))
     for _ in range(moves):
         if reestimated:
             trace, _ = generate(program, STEPS, observed(T), count, {"rho": trace["rho"]})
@@ -264,7 +265,7 @@ def test_a_parameter_out_of_its_support_runs_no_filter(monkeypatch: pytest.Monke
     def out(trace: Trace) -> None:
         pyro.sample("rho", dist.Normal(torch.tensor([0.2, 1.7, -3.0, 0.1], dtype=torch.float64), 1e-3))
 
-    _, accepted = metropolis_hastings(out)(equal_weights(trace))(trace, POSTERIOR)
+    _, accepted = metropolis_hastings(out)(Population(trace))(trace, POSTERIOR)
     assert run == [2] * T and not bool(accepted[1:3].any())
 
 

@@ -14,10 +14,11 @@ from bcppl import poses
 from bcppl.distributions.poses import NormalPose
 from bcppl.inference import adaptive_hmc, markov_chains, tempered, tempered_importance_sampling
 from bcppl.inference.kernels import Kernel, fitted, hmc, metropolis_hastings
+from bcppl.inference.population import Population
 from bcppl.inference.proposals import differential_evolution, drift, independent, joint_drift, spread_of
 from bcppl.inference.proposals.spread import weighted_places
 from bcppl.traces import Series, extend, generate, simulate
-from tests.invariance import equal_weights, number
+from tests.invariance import number
 
 
 def shifted() -> None:
@@ -65,7 +66,7 @@ def test_the_scale_does_not_depend_on_where_the_particle_is() -> None:
     for scale, x in states:
         torch.manual_seed(1)
         trace, _ = generate(scaled, (), {}, 1, {"scale": scale, "x": x})
-        scales.append(spread_of("x")(equal_weights(trace)))
+        scales.append(spread_of("x")(Population(trace)))
     assert torch.equal(*scales) and 1.0 < float(scales[0].sqrt()) < 3.0
 
 
@@ -96,7 +97,7 @@ def test_the_scale_is_that_of_the_coordinates() -> None:
         pyro.sample("heavy", dist.Cauchy(number(0.0), 1.0))
 
     trace = simulate(program, (), 1)[torch.zeros(30, dtype=torch.int64)]
-    population = equal_weights(trace)
+    population = Population(trace)
     root = spread_of("part")(population).diagonal().sqrt()
     assert bool(((root / spread).log().abs() < 0.2).all())
     log_rate = float(spread_of("rate")(population).sqrt())
@@ -107,7 +108,7 @@ def test_the_scale_is_that_of_the_coordinates() -> None:
 def test_where_particles_differ_nothing_is_drawn() -> None:
     def along(first: Tensor) -> Tensor:
         trace, _ = generate(plane, (), {}, 2, {"x": torch.stack([first, number(2.0).expand(2)], dim=1)})
-        return weighted_places(equal_weights(trace), "x").unlearned
+        return weighted_places(Population(trace), "x").unlearned
 
     def plane() -> None:
         pyro.sample("x", dist.Normal(torch.zeros(2).double(), torch.tensor([1.0, 10.0])).to_event(1))
@@ -115,7 +116,7 @@ def test_where_particles_differ_nothing_is_drawn() -> None:
     torch.manual_seed(0)
     unlearned = along(torch.tensor([1.0, 1.0 + 1e-9], dtype=torch.float64))
     assert float(unlearned[0]) == 0.0 and 7.0 < float(unlearned[1].sqrt()) < 13.0
-    population, state = equal_weights(simulate(shifted, (), 3)), torch.get_rng_state()
+    population, state = Population(simulate(shifted, (), 3)), torch.get_rng_state()
     fitted(hmc("x"), population)
     assert torch.equal(torch.get_rng_state(), state)
 
@@ -128,4 +129,4 @@ def test_a_step_of_a_series_has_the_scale_of_that_step() -> None:
     torch.manual_seed(0)
     trace, _ = generate(series, (), {}, 1)
     longer, _ = extend(trace, (), {})
-    assert 2.4 < float(spread_of("x")(equal_weights(longer)).sqrt()) < 3.6
+    assert 2.4 < float(spread_of("x")(Population(longer)).sqrt()) < 3.6

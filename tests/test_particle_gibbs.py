@@ -14,12 +14,13 @@ from torch import Tensor
 from bcppl.errors import InputError
 from bcppl.inference import markov_chains
 from bcppl.inference.kernels import hmc, metropolis_hastings, sequence
+from bcppl.inference.population import Population
 from bcppl.inference.proposals import drift
 from bcppl.inference.series import conditional, particle_gibbs, unrolled
 from bcppl.inference.series.conditional import _Conditional
 from bcppl.inference.targets import POSTERIOR, Target
 from bcppl.traces import Series, Trace, assess, extend, generate, simulate
-from tests.invariance import equal_weights, largest_z, number
+from tests.invariance import largest_z, number
 from tests.linear_series import (
     AUTOREGRESSION,
     NOISE,
@@ -65,7 +66,7 @@ def test_the_path_is_left_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
     before = exact_paths(with_known(RHO), 20_000, *smoothed(RHO, T))
 
     def moved() -> float:
-        after, changed = particle_gibbs(particles=3)(equal_weights(before))(before, POSTERIOR)
+        after, changed = particle_gibbs(particles=3)(Population(before))(before, POSTERIOR)
         assert 0.3 < float(changed.mean()) < 1.0
         return largest_z(moments(before), moments(after))
 
@@ -90,7 +91,7 @@ def test_a_tempered_target_is_left_as_it_was() -> None:
     values = {address: x[:, t] for t, address in enumerate(PATH)}
     before, _ = generate(unrolled(with_known(RHO)), ([()] * T,), observed(T), len(x), values)
     target = Target({f"y/{t}": 0.0 for t in range(3, T + 1)})
-    after, _ = particle_gibbs(particles=4)(equal_weights(before))(before, target)
+    after, _ = particle_gibbs(particles=4)(Population(before))(before, target)
     assert largest_z(moments(before), moments(after)) < 4.5
 
 
@@ -99,9 +100,9 @@ def test_exponents_of_the_path_itself_are_the_targets() -> None:
     exponents = (1.0, 0.4, 1.0, 2.0, 0.4, 1.0)
     before = exact_paths(with_known(RHO), 20_000, *smoothed(RHO, T, exponents))
     target = Target(dict(zip(PATH, exponents, strict=True)))
-    after, _ = particle_gibbs(particles=6)(equal_weights(before))(before, target)
+    after, _ = particle_gibbs(particles=6)(Population(before))(before, target)
     assert largest_z(moments(before), moments(after)) < 4.5
-    plain, _ = particle_gibbs(particles=6)(equal_weights(before))(before, POSTERIOR)
+    plain, _ = particle_gibbs(particles=6)(Population(before))(before, POSTERIOR)
     assert largest_z(moments(before), moments(plain)) > 8.0
 
 
@@ -144,10 +145,10 @@ def test_a_state_that_holds_the_past_restricts_the_ancestors(monkeypatch: pytest
     sums = torch.cat([torch.zeros(T, 1, dtype=torch.float64), sums], dim=1)
     covariance = torch.linalg.inv(lag.T @ lag + sums.T @ sums / NOISE**2)
     before = exact_paths(summed(), 20_000, covariance @ sums.T @ SEEN[:T] / NOISE**2, covariance)
-    after, _ = particle_gibbs(particles=4)(equal_weights(before))(before, POSTERIOR)
+    after, _ = particle_gibbs(particles=4)(Population(before))(before, POSTERIOR)
     assert largest_z(moments(before), moments(after)) < 4.5
     monkeypatch.setattr(conditional, "same", lambda a, b, count: torch.ones(count, dtype=torch.bool))
-    after, _ = particle_gibbs(particles=4)(equal_weights(before))(before, POSTERIOR)
+    after, _ = particle_gibbs(particles=4)(Population(before))(before, POSTERIOR)
     assert largest_z(moments(before), moments(after)) > 8.0
 
 
@@ -160,7 +161,7 @@ def test_a_discrete_path_reaches_its_smoothing_distribution() -> None:
 
     series = Series(begin, hmm().step)
     trace, _ = generate(unrolled(series), ([()] * 4,), symbols, 4000)
-    move = particle_gibbs(particles=5)(equal_weights(trace))
+    move = particle_gibbs(particles=5)(Population(trace))
     for _ in range(6):
         trace, _ = move(trace, POSTERIOR)
     shares = torch.stack(
@@ -189,7 +190,7 @@ def test_few_particles_move_a_long_path() -> None:
     torch.manual_seed(0)
     series = with_known(RHO)
     trace, _ = generate(unrolled(series), ([()] * 20,), observed(20), 100)
-    move = particle_gibbs(particles=5)(equal_weights(trace))
+    move = particle_gibbs(particles=5)(Population(trace))
     after, _ = move(trace, POSTERIOR)
     assert float((after["x/1"] != trace["x/1"]).double().mean()) > 0.5
 
@@ -200,13 +201,13 @@ def test_refusals_say_what_to_do() -> None:
         particle_gibbs("rho", particles=1)
     with pytest.raises(InputError, match="generate one from `unrolled"):
         other = simulate(AUTOREGRESSION, (), 3)
-        particle_gibbs("rho")(equal_weights(other))(other, POSTERIOR)
+        particle_gibbs("rho")(Population(other))(other, POSTERIOR)
     with pytest.raises(InputError, match="give a `Target`"):
-        particle_gibbs("rho")(equal_weights(trace))(trace, lambda each: each.log_prob())
+        particle_gibbs("rho")(Population(trace))(trace, lambda each: each.log_prob())
     with pytest.raises(InputError, match="'phi'"):
-        particle_gibbs("phi")(equal_weights(trace))(trace, POSTERIOR)
+        particle_gibbs("phi")(Population(trace))(trace, POSTERIOR)
     with pytest.raises(InputError, match="keep 'x/1', which `init` does not sample"):
-        particle_gibbs("x/1")(equal_weights(trace))(trace, POSTERIOR)
+        particle_gibbs("x/1")(Population(trace))(trace, POSTERIOR)
 
 
 def test_a_parameter_that_stays_weighs_what_it_depends_on() -> None:
@@ -222,7 +223,7 @@ def test_a_parameter_that_stays_weighs_what_it_depends_on() -> None:
     series = Series(begin, AUTOREGRESSION.step)
     given = {"rho": torch.full((count,), rho, dtype=torch.float64)}
     trace, _ = generate(unrolled(series), ([()] * 2,), observed(2), count, given)
-    move = particle_gibbs("rho", particles=20)(equal_weights(trace))
+    move = particle_gibbs("rho", particles=20)(Population(trace))
     for _ in range(5):
         trace, _ = move(trace, POSTERIOR)
     drawn = trace["precision"]

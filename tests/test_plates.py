@@ -227,7 +227,7 @@ def test_kernels_move_as_many_particles_as_a_plate_has_entries(particles: int) -
         mean = centre + wide * torch.randn(particles, dtype=torch.float64)
         x = (mean[:, None] + 4 * y) / 5 + 5**-0.5 * torch.randn(particles, POINTS, dtype=torch.float64)
         start, _ = generate(hierarchy, (), {"y": y}, particles, {"mean": mean, "x": x})
-        population = Population(start, torch.zeros(particles, dtype=torch.float64))
+        population = Population(start)
         kernel = sequence([metropolis_hastings(drift("x")), hmc("mean", "x", steps=3)])
         trace = moved_by(population, kernel, POSTERIOR).population.trace
         before, after = (torch.cat([t["mean"][:, None], t["x"]], dim=1) for t in (start, trace))

@@ -14,12 +14,13 @@ from scipy.stats import chi2, kstest
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.distributions.checks import THRESHOLD, Check
 from bcppl.distributions.depth import RobustDepth
 from bcppl.distributions.depth.image import DepthDistribution
 from bcppl.distributions.manifold import ContactManifold
 from bcppl.distributions.poses import NormalPose
 from bcppl.errors import InputError
-from bcppl.inference.criticism.predictive import THRESHOLD, Check, surprise
+from bcppl.inference.criticism.predictive import surprise
 from bcppl.inference.population import Population
 from bcppl.models.worlds.bench.parameters import BenchParameters
 from bcppl.models.worlds.bench.scene import BenchScene, bench_scene
@@ -120,7 +121,7 @@ def exact(observed: list[float], count: int) -> Population:
     seen = {f"y_{k}": torch.tensor(y, dtype=torch.float64) for k, y in enumerate(observed)}
     trace = generate(lines, (len(observed),), seen, count)[0]
     drawn = mean + deviation * torch.randn(count, dtype=torch.float64)
-    return Population(trace.at({"x": drawn}), torch.zeros(count, dtype=torch.float64))
+    return Population(trace.at({"x": drawn}))
 
 
 def test_normal_values_at_draws_of_the_posterior_have_uniform_p_values() -> None:

@@ -26,7 +26,7 @@ from bcppl.inference.design import (
 from bcppl.inference.population import Population
 from bcppl.poses import FREE, Freedom
 from bcppl.traces import generate, simulate
-from tests.invariance import equal_weights, matrix
+from tests.invariance import matrix
 from tests.probing_programs import CENTER, PLANAR, at, doubled, particles
 
 
@@ -195,9 +195,9 @@ def test_bad_input_is_one_sentence() -> None:
             call()
         text = str(caught.value)
         assert message in text and text.endswith(".") and "\n" not in text, text
-    discrete = equal_weights(simulate(lambda: pyro.sample("k", dist.Categorical(torch.ones(3))), (), 20))
+    discrete = Population(simulate(lambda: pyro.sample("k", dist.Categorical(torch.ones(3))), (), 20))
     with pytest.raises(InputError, match="whole numbers, which have no density; use discrete_entropy"):
         fitted(mixture_entropy("k"), discrete)
     same = generate(discrete.trace.program, (), {}, 20, choices={"k": torch.zeros(20, dtype=torch.int64)})[0]
     with pytest.raises(InputError, match="collapsed to a point"):
-        fitted(discrete_entropy("k"), equal_weights(same))
+        fitted(discrete_entropy("k"), Population(same))

@@ -33,7 +33,7 @@ from bcppl.inference.design.observations import simulate_candidates
 from bcppl.inference.population import Population
 from bcppl.rendering.ray_casting import RayCaster
 from bcppl.traces import Series, Trace, carried, extend, generate, simulate
-from tests.invariance import equal_weights, matrix, number
+from tests.invariance import matrix, number
 
 
 class Counted(LazyDistribution):
@@ -163,7 +163,7 @@ def test_an_image_is_rendered_no_more_often_than_four_times() -> None:
 
     torch.manual_seed(0)
     mask = torch.rand(18, 24) < 0.6
-    population = equal_weights(simulate(seen, (0, mask), 20))
+    population = Population(simulate(seen, (0, mask), 20))
     one = next(simulate_candidates(population.trace, [1], lambda views: (views, mask), (), 0))
     before = renderer.effort.items
     values = one.draw(torch.arange(20), 1)
@@ -263,7 +263,7 @@ def unforeseen(touches: int) -> None:
 
 def test_a_predictive_sampler_serves_sites_that_cannot_be_sampled() -> None:
     torch.manual_seed(0)
-    population = equal_weights(simulate(unforeseen, (0,), 800))
+    population = Population(simulate(unforeseen, (0,), 800))
 
     def predict(touch: int, trace: Trace) -> dict[str, Tensor]:
         return {"y_0": trace["x"][:, None] + 0.2 * torch.randn(len(trace), 2, dtype=torch.float64)}
@@ -297,7 +297,7 @@ def test_new_latent_values_are_not_observed() -> None:
             pyro.sample(f"y_{k}", dist.Normal(x + bias, 0.3))
 
     torch.manual_seed(0)
-    population = equal_weights(simulate(biased, ([],), 4000))
+    population = Population(simulate(biased, ([],), 4000))
     ranking = expected_information_gain(
         population,
         [0.01, 2.0],
@@ -324,7 +324,7 @@ def test_a_series_is_run_on_by_a_step() -> None:
     torch.manual_seed(0)
     start, _ = generate(Series(init, step), (), {}, 300)
     ranking = expected_information_gain(
-        equal_weights(start),
+        Population(start),
         [5.0, 0.3],
         lambda noise: (noise,),
         mixture_entropy("x"),
@@ -351,7 +351,7 @@ def test_outer_samples_whose_simulation_failed_are_left_out_and_counted() -> Non
             pyro.sample(f"y_{k}", Fragile(x))
 
     torch.manual_seed(0)
-    population = equal_weights(simulate(fragile, (0,), 60))
+    population = Population(simulate(fragile, (0,), 60))
     failed = int((population["x"] > 1.0).sum())
     with pytest.warns(UserWarning, match=f"candidate 0 leaves out {failed} of 60 outer samples"):
         ranking = expected_information_gain(population, [1], lambda touch: (touch,), seed=0)

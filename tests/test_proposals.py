@@ -17,6 +17,7 @@ from bcppl.distributions.poses import NormalPose
 from bcppl.distributions.vectors import NormalMixture
 from bcppl.errors import InputError
 from bcppl.inference.kernels import metropolis_hastings, moved_by
+from bcppl.inference.population import Population
 from bcppl.inference.proposals import (
     Continuous,
     Fitted,
@@ -45,7 +46,7 @@ from tests.exact_targets import (
     two_modes,
     wide,
 )
-from tests.invariance import equal_weights, largest_z, matrix
+from tests.invariance import largest_z, matrix
 
 DRAWS = 7_000
 SOUND, BROKEN = 4.5, 8.0  # |z| of the worst of a few dozen expectations: below if invariant, above if not
@@ -75,7 +76,7 @@ def worst_z(
     Each draw is compared with itself; what is fitted is fitted to draws of its own.
     """
     torch.manual_seed(1)
-    move = metropolis_hastings(proposal)(equal_weights(exact(30)))
+    move = metropolis_hastings(proposal)(Population(exact(30)))
     trace = exact(DRAWS)
 
     def all_of(trace: Trace) -> Tensor:
@@ -158,7 +159,7 @@ def test_prior_leaves_the_target_invariant(addresses: tuple[str, ...]) -> None:
 
 
 def test_prior_is_always_accepted_where_nothing_else_hangs_on_it() -> None:
-    move = metropolis_hastings(prior("below", "top", "each"))(equal_weights(simulate(bounded, (), 2)))
+    move = metropolis_hastings(prior("below", "top", "each"))(Population(simulate(bounded, (), 2)))
     _, accepted = move(simulate(bounded, (), 50), POSTERIOR)
     assert bool((accepted == 1.0).all())
 
@@ -219,10 +220,10 @@ def test_mutant_that_is_fitted_to_the_particles_it_moves() -> None:
         torch.manual_seed(3)
         changes = []
         for _ in range(replicates):
-            before = after = equal_weights(simulate(gaussian, (), 4))
+            before = after = Population(simulate(gaussian, (), 4))
             for _ in range(3):
                 if own:
-                    after = equal_weights(kernel(after)(after.trace, POSTERIOR)[0])
+                    after = Population(kernel(after)(after.trace, POSTERIOR)[0])
                 else:
                     after = moved_by(after, kernel, POSTERIOR).population
             changes.append((after.trace["x"].square() - before.trace["x"].square()).mean())
@@ -247,7 +248,7 @@ def test_a_way_there_has_the_density_that_assess_gives_it(name: str) -> None:
     proposal, case = ROUND_TRIPS[name]
     torch.manual_seed(0)
     exact = CASES[case][0]
-    program = program_of(proposal, (), equal_weights(exact(40)))
+    program = program_of(proposal, (), Population(exact(40)))
     trace = exact(30)
     there = propose(program, (trace,), 30)
     torch.testing.assert_close(assess(program, (trace,), there.choices, 30), there.log_prob)
@@ -260,7 +261,7 @@ def test_a_way_there_has_the_density_that_assess_gives_it(name: str) -> None:
 
 def test_a_mixture_is_fitted_to_both_modes() -> None:
     torch.manual_seed(0)
-    population = equal_weights(simulate(two_modes, (), 200))
+    population = Population(simulate(two_modes, (), 200))
     program = program_of(independent("pose", 2, wide=(0.01, 3.0)), (), population)
     proposed = propose(program, (population.trace,), 200).choices["pose"]
     true = two_modes_density(proposed)
@@ -276,7 +277,7 @@ def two_modes_density(pose: Tensor) -> Tensor:
 
 def test_whole_differences_lead_from_mode_to_mode() -> None:
     torch.manual_seed(0)
-    population = equal_weights(simulate(two_modes, (), 60))
+    population = Population(simulate(two_modes, (), 60))
     trace = simulate(two_modes, (), 2000)
 
     def turned(trace: Trace) -> Tensor:
@@ -293,7 +294,7 @@ def test_whole_differences_lead_from_mode_to_mode() -> None:
     "make", [lambda a: drift(a), lambda a: independent(a), lambda a: differential_evolution(a)]
 )
 def test_discrete_and_unknown_addresses_are_refused(make: Callable[[str], Fitted]) -> None:
-    population = equal_weights(simulate(choosing, (), 8))
+    population = Population(simulate(choosing, (), 8))
     with pytest.raises(InputError, match=r"'which' is discrete.*prior\('which'\)"):
         make("which").fit(population)
     with pytest.raises(InputError, match=r"'elsewhere'.*latent are which, x, z"):
@@ -305,7 +306,7 @@ def test_a_support_without_coordinates_is_refused() -> None:
         pyro.sample("at", dist.ProjectedNormal(matrix([1.0, 0.0, 0.0])))
 
     with pytest.raises(InputError, match=r"'at'.*no unbounded coordinates"):
-        drift("at").fit(equal_weights(simulate(directions, (), 4)))
+        drift("at").fit(Population(simulate(directions, (), 4)))
 
 
 def test_symmetries_that_cannot_be_are_refused() -> None:
@@ -320,5 +321,5 @@ def test_symmetries_that_cannot_be_are_refused() -> None:
 def test_copies_of_one_particle_teach_what_they_can() -> None:
     trace = simulate(two_modes, (), 1)[[0] * 8]
     for name, make in LEARNING.items():
-        done = moved_by(equal_weights(trace), metropolis_hastings(make("pose")), POSTERIOR)
+        done = moved_by(Population(trace), metropolis_hastings(make("pose")), POSTERIOR)
         assert bool(torch.isfinite(done.population.trace.log_prob()).all()), name

@@ -18,10 +18,11 @@ from bcppl.errors import InputError
 from bcppl.inference.filters import smcp3
 from bcppl.inference.filters.smcp3 import Pair, moved
 from bcppl.inference.kernels.jacobian import Charted, Real, Tangent
+from bcppl.inference.population import Population
 from bcppl.inference.proposals import drift
 from bcppl.poses import Freedom
 from bcppl.traces import Trace, simulate
-from tests.invariance import equal_weights, largest_z, number
+from tests.invariance import largest_z, number
 from tests.smcp3_programs import flat, nothing, silent
 
 DRAWS = 20_000
@@ -181,7 +182,7 @@ def worst_z(case: str) -> float:
     program, pair, functions = CASES[case]
     torch.manual_seed(1)
     trace = simulate(program, (), DRAWS)
-    population = moved(equal_weights(trace), pair)
+    population = moved(Population(trace), pair)
     weights = torch.exp(population.log_weights)[:, None]
     one = torch.ones(DRAWS, 1, dtype=torch.float64)
     before = torch.cat([one, functions(trace)], dim=1)
@@ -246,7 +247,7 @@ def test_mutant_with_the_volume_of_the_seven_numbers(monkeypatch: pytest.MonkeyP
 
 def test_pairs_that_are_refused_name_the_address() -> None:
     torch.manual_seed(0)
-    population = equal_weights(simulate(vector, (), 7))
+    population = Population(simulate(vector, (), 7))
 
     def refused(match: str, forward: Any, backward: Any, check: bool = True) -> None:
         with pytest.raises(InputError, match=match) as caught:

@@ -178,5 +178,5 @@ def test_what_a_step_determines_is_that_of_each_particles_ancestor() -> None:
         trace, _ = extend(trace[torch.randint(6, (6,))], (), {})
     for then in (1, 2, -1):
         torch.testing.assert_close(trace["square", then], trace["x", then] ** 2)
-    found = Population(trace, torch.zeros(6, dtype=torch.float64))
+    found = Population(trace)
     torch.testing.assert_close(mean(found, ("square", 1)), (trace["x", 1] ** 2).mean())

@@ -10,10 +10,11 @@ import pytest
 import torch
 
 from bcppl import poses
+from bcppl.distributions.checks import THRESHOLD
 from bcppl.distributions.touch import ForceDirection, OnsetLocation, Path
 from bcppl.distributions.touch.outliers import touch_check
 from bcppl.inference import infer
-from bcppl.inference.criticism.predictive import THRESHOLD, surprise
+from bcppl.inference.criticism.predictive import surprise
 from bcppl.inference.population import Population
 from bcppl.models.point_probe import model
 from bcppl.sensors import Measurement

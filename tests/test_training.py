@@ -17,9 +17,10 @@ from bcppl.errors import InferenceError, InputError
 from bcppl.inference import Observed, Pair, importance_sampling, smcp3
 from bcppl.inference.kernels import metropolis_hastings
 from bcppl.inference.learning import Amortised, Checks, evidence_bound, forward_kl, objectives, train
+from bcppl.inference.population import Population
 from bcppl.inference.targets import POSTERIOR
 from bcppl.traces import generate
-from tests.invariance import equal_weights, number
+from tests.invariance import number
 
 # x ~ N(0, 2^2), y | x ~ N(x, 1): the posterior is N(0.8 y, 0.8), the evidence N(y; 0, 5).
 GAIN, VARIANCE, ENTROPY = 0.8, 0.8, 0.5 * math.log(2.0 * math.pi * math.e * 0.8)
@@ -249,12 +250,12 @@ def test_a_trained_proposal_moves_particles() -> None:
     torch.manual_seed(0)
     trace, _ = generate(program, (), SEEN, 20_000)
     exact = trace.at({"x": GAIN * 1.5 + math.sqrt(VARIANCE) * torch.randn(20_000).double()})
-    move = metropolis_hastings(Amortised(Linear(0.6, 0.3, 0.2)))(equal_weights(exact))
+    move = metropolis_hastings(Amortised(Linear(0.6, 0.3, 0.2)))(Population(exact))
     moved, accepted = move(exact, POSTERIOR)
     assert 0.5 < float(accepted.mean()) < 0.95
     assert float(moved["x"].mean()) == pytest.approx(1.2, abs=0.03)
     assert float(moved["x"].var()) == pytest.approx(VARIANCE, abs=0.04)
-    _, all_accepted = metropolis_hastings(Amortised(Linear(*BEST)))(equal_weights(exact))(exact, POSTERIOR)
+    _, all_accepted = metropolis_hastings(Amortised(Linear(*BEST)))(Population(exact))(exact, POSTERIOR)
     assert bool((all_accepted == 1.0).all())
 
 

@@ -35,7 +35,7 @@ def believed(x: Tensor, y: Tensor, prior: Any = GUESS, *, observed: bool = True)
     pose[:, 0], pose[:, 1], pose[:, 2] = x, y, 0.001 * torch.cos(3.1 * torch.arange(COUNT))
     known = {"reading": torch.tensor(0.0).double()} if observed else {}
     trace, _ = generate(program, (), known, COUNT, {"part": pose})
-    return Population(trace, torch.zeros(COUNT, dtype=torch.float64))
+    return Population(trace)
 
 
 ALONG = torch.linspace(-0.018, 0.018, COUNT, dtype=torch.float64)

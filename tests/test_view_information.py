@@ -135,7 +135,7 @@ def test_views_and_touches_stand_in_one_ranking() -> None:
     trace, _ = generate(model.program, (scene, []), {}, 40)
     spread = torch.tensor([2e-3] * 3 + [0.02] * 3, dtype=torch.float64)
     near = poses.retract(torch.from_numpy(world.truth), spread * torch.randn(40, 6, dtype=torch.float64))
-    population = Population(trace.at({"part": near}), torch.zeros(40, dtype=torch.float64))
+    population = Population(trace.at({"part": near}))
     away = replace(recording.measurements[0].action.camera, name="away", device="")
     blind = replace(away, world_from_camera=looking_at(np.array([0.5, 0.5, 1.9]), np.array([0.5, 0.0, 0.1])))
     plan = _down(world)

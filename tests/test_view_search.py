@@ -49,7 +49,7 @@ def believed(scene: BenchScene, recording: Recording, off: float) -> Population:
     name = actions[0].camera.instrument
     bias = torch.full((12,), float(scene.range_bias[0]), dtype=torch.float64)
     there = {"part": around, f"seen_by_{name}": around, f"bias_{name}": bias}
-    return Population(trace.at(there), torch.zeros(12, dtype=torch.float64))
+    return Population(trace.at(there))
 
 
 @pytest.mark.parametrize("off", [0.0, 0.05])

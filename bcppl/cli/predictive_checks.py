@@ -11,11 +11,11 @@ import torch
 
 from bcppl import poses
 from bcppl.beliefs import Belief
-from bcppl.distributions.checks import chi_square
+from bcppl.distributions.checks import THRESHOLD, Check, chi_square
 from bcppl.geometry.convex.hausdorff import hausdorff_error
 from bcppl.inference.criticism.hypotheses import Displaced, Edge, alternatives, displaced, edges, likeliest
 from bcppl.inference.criticism.nuisances import SuddenChange, sudden_changes
-from bcppl.inference.criticism.predictive import THRESHOLD, Check, surprise
+from bcppl.inference.criticism.predictive import surprise
 from bcppl.inference.criticism.undetermined import Undetermined, undetermined
 from bcppl.inference.population import Population
 from bcppl.recordings import Recording

@@ -99,7 +99,7 @@ def check_kernel(
     seed = whole_number("a kernel is to be checked with the seed {}", seed, least=0)
     with undisturbed(seed):
         taught = simulate(program, args, TAUGHT)
-        move = fitted(kernel, Population(taught, torch.zeros(TAUGHT, dtype=torch.float64)))
+        move = fitted(kernel, Population(taught))
         trace = simulate(program, args, draws)
         _check_alone(move, trace[:REPEATED], moves, data)
         quantities = _quantities(trace, data)

@@ -34,15 +34,13 @@ from torch import Tensor
 
 from bcppl.arguments import whole_number
 from bcppl.devices import HOST, on_host
-from bcppl.distributions.checks import THRESHOLD, Check, Checked, chi_square
+from bcppl.distributions.checks import Check, Checked, chi_square
 from bcppl.distributions.poses import NormalPose
 from bcppl.inference.population import Population
 from bcppl.inference.resampling import seeded, systematic
 from bcppl.traces import Trace
 from bcppl.traces.series import SeriesTrace
 from bcppl.traces.verbs import at_device
-
-__all__ = ["THRESHOLD", "Check", "surprise"]
 
 PARTICLES = 4
 REPLICAS = 10  # images for each particle

@@ -29,7 +29,6 @@ from bcppl.devices import (
 )
 from bcppl.errors import InferenceError, InputError
 from bcppl.inference.filters.step import Observed, StepFunction, StepInfo, refuse_no_step
-from bcppl.inference.filters.tempering import tempered
 from bcppl.inference.population import Population
 from bcppl.inference.progress import watched
 from bcppl.inference.verbs import initialize, observations_of
@@ -76,8 +75,6 @@ class Info(NamedTuple):
         """Of the population afterwards."""
         return self.step.effective_sample_size
 
-
-__all__ = ["Info", "Step", "smc", "tempered"]
 
 # Below this many particles, sharing a tensor out among threads takes longer than working on it.
 FEW_PARTICLES = 5000

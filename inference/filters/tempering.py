@@ -201,7 +201,7 @@ def tempered(
             depends on where they are, so moves that are made only then leave a bias of order 1/N in the
             evidence (one of 2 % with three particles). With it, or resampling always, and with fixed
             exponents and proposals, the estimate of the evidence is unbiased.
-        rejuvenation: in place of `kernel`, `sweeps` and `resample`, such as `waste_free(...)`.
+        rejuvenation: in place of `kernel`, `sweeps` and `resample`, such as `waste_free_moves(...)`.
 
     Returns:
         The step. It raises InferenceError where no particle is left with any weight.

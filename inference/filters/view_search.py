@@ -19,10 +19,11 @@ from typing import Any
 
 import torch
 
+from bcppl.distributions.checks import THRESHOLD
 from bcppl.distributions.depth import DepthDistribution
 from bcppl.distributions.support import freedom_of
 from bcppl.errors import NoWeightError
-from bcppl.inference.criticism.predictive import THRESHOLD, surprise
+from bcppl.inference.criticism.predictive import surprise
 from bcppl.inference.filters.second_search import Searched, joined_with_draws
 from bcppl.inference.population import Population
 from bcppl.inference.proposals.climbing import modes

@@ -25,12 +25,9 @@ from bcppl.inference.kernels.hamiltonian import hmc
 from bcppl.inference.kernels.hastings import metropolis_hastings
 from bcppl.inference.kernels.involutions import involutive
 from bcppl.inference.kernels.kernel import Kernel, Move, fitted, scattered
-from bcppl.inference.kernels.rejuvenation import Moved, Until, displacement, distinct, moved_by, until
+from bcppl.inference.kernels.rejuvenation import Until, displacement, distinct, moved_by, until
 from bcppl.inference.kernels.staged import (
-    Screened,
-    Staged,
     Surrogate,
-    SurrogateTarget,
     delayed_acceptance,
     student_t,
     surrogate_transition,
@@ -39,11 +36,7 @@ from bcppl.inference.kernels.staged import (
 __all__ = [
     "Kernel",
     "Move",
-    "Moved",
-    "Screened",
-    "Staged",
     "Surrogate",
-    "SurrogateTarget",
     "Until",
     "cycle",
     "delayed_acceptance",

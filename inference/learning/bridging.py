@@ -12,7 +12,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from bcppl.arguments import whole_number
@@ -85,7 +84,7 @@ def bridged(
         raise InputError("a proposal for bridging samples no address; temper from the prior instead.")
     trace, _ = generate(program, args, observations, particles, proposed.choices)
     start = _Start(proposal, args, tuple(proposed.choices))
-    population = Population(trace, torch.zeros(particles, dtype=torch.float64))
+    population = Population(trace)
     ratio, exponents, acceptances, resampled = trace.log_prob() - start(trace), [0.0], [], 0
     resample = adaptive(threshold=resampled_below(share))
     ancestors, before = None, float("nan")
