@@ -13,12 +13,11 @@ from typing import NamedTuple, Protocol
 
 import mujoco
 import numpy as np
-import numpy.typing as npt
 from scipy.signal import butter, lfilter, lfilter_zi
 
+from bcppl.arrays import Array
 from bcppl.geometry.parts import Part
 
-Array = npt.NDArray[np.float64]
 Motion = Generator[Array, float, None]  # yields commanded poses (7,), is sent the force that is felt, N
 
 STEP = 1e-4  # s of physics

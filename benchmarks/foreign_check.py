@@ -14,11 +14,10 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 from trimesh.proximity import signed_distance
 
+from bcppl.arrays import Array
 from bcppl.geometry.parts import Part
 from bcppl.sensors.measurements import Recording
 from bcppl.sensors.probe import ProbeWindow
-
-Array = npt.NDArray[np.float64]
 
 PRESSED, SLOW = 2.0, 0.02  # N and m/s: a stamp with more force and less speed is one of contact
 FREE = 0.004  # m: beyond it a gap is not computed exactly

@@ -6,11 +6,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 from foreign_world import windows
 from scipy.ndimage import label, median_filter
 from scipy.spatial.transform import Rotation
 
+from bcppl.arrays import Array
 from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera
 from bcppl.geometry.parts import Part, Piece
@@ -18,7 +18,6 @@ from bcppl.sensors.depth import DepthImage, View
 from bcppl.sensors.measurements import Measurement, Recording
 from bcppl.sensors.probe import Probe, ProbeWindow, Touch
 
-Array = npt.NDArray[np.float64]
 Fault = Callable[[Recording], Recording]
 
 SEEN = 0.004  # m: a pixel nearer than the background by more shows the part

@@ -19,16 +19,14 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from foreign_arm import Log, composed, inverse
 from foreign_parts import LENGTH
 from foreign_world import TICK, Scene, log_of, recording_of
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
+from bcppl.arrays import Array
 from bcppl.sensors.measurements import Recording
-
-Array = npt.NDArray[np.float64]
 
 SINGLE = ("grasp", "creep", "slide", "small_slides", "backlash", "rough_kinematics", "late_wrench")
 MECHANISMS = {

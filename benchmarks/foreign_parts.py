@@ -6,17 +6,15 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import shapely
 import trimesh
 from shapely.affinity import translate
 
+from bcppl.arrays import Array
 from bcppl.geometry.extrusion import extruded
 from bcppl.geometry.layers import prismatic
 from bcppl.geometry.outlines import round_outline
 from bcppl.geometry.parts import Part, Piece
-
-Array = npt.NDArray[np.float64]
 
 SIDES = 32  # of a round hole and of the peg
 LENGTH, BEVEL = 0.09, 0.0004  # m: of the peg from the wrench sensor to the tip, and of its tip's edge

@@ -5,16 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 from scipy.ndimage import maximum_filter, minimum_filter
 from scipy.spatial.transform import Rotation
 
+from bcppl.arrays import Array
 from bcppl.geometry.camera import Camera, looking_at
 from bcppl.geometry.parts import Part
 from bcppl.sensors.depth import DepthImage, View
 from bcppl.sensors.measurements import Measurement
-
-Array = npt.NDArray[np.float64]
 
 OFF, TURNED = 0.002, np.radians(0.5)  # root mean square of a camera's whole error: m, rad
 BIAS = 0.002  # m, standard deviation of an image's range bias

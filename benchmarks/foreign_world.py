@@ -14,19 +14,17 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from foreign_arm import NOMINAL, Hidden, Log, Mechanics, Motion, carried_out
 from foreign_parts import LENGTH, PARTS, ForeignPart, Place, peg
 from foreign_views import perturbed, views
 from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 
+from bcppl.arrays import Array
 from bcppl.geometry.parts import Guess, Part
 from bcppl.recordings import load, save
 from bcppl.sensors.measurements import Measurement, Recording
 from bcppl.sensors.probe import Probe, ProbeWindow, Touch
-
-Array = npt.NDArray[np.float64]
 
 MANNERS = {"taps": (6, 6.0), "presses": (7, 12.0)}  # how many, within how many seconds
 CONTACTS = {"softer": (-1.0, 0.0), "stiffer": (0.0, 1.0)}  # log10 of a contact's stiffness over the nominal

@@ -22,7 +22,6 @@ from typing import Any, NamedTuple
 import arm
 import clutter
 import numpy as np
-import numpy.typing as npt
 import torch
 from peer import ask
 from report import Row, finish, options, show
@@ -43,6 +42,7 @@ from touches import (
 )
 
 from bcppl import poses
+from bcppl.arrays import Array
 from bcppl.distributions.poses import prior_from_guess
 from bcppl.sweeps import in_order
 
@@ -54,8 +54,6 @@ STARTS = 30  # poses that CHSEL starts from and gives back
 MASSES = (0.5, 0.9)
 CONFIDENCE = 0.99  # of the intervals of a share
 MEASURES = ("yaw", "position")  # CHSEL's measures of diversity: the first is its default
-
-Array = npt.NDArray[np.float64]
 
 
 class Answer(NamedTuple):

@@ -28,12 +28,11 @@ from embreex.rtcore_scene import EmbreeScene
 from report import DATA, Row, cores, finish, options, show
 from scipy.spatial.transform import Rotation
 
+from bcppl.arrays import Array
 from bcppl.geometry.camera import Camera
 from bcppl.geometry.parts import Part
 from bcppl.rendering.rasterisation import Rasteriser, renderer_for
 from bcppl.rendering.ray_casting import RayCaster
-
-Array = npt.NDArray[np.float64]
 
 SIZES = ((128, 128), (160, 120), (640, 480))
 DRILL = DATA / "ycb_power_drill" / "textured_simple_reoriented.obj"

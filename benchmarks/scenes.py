@@ -19,11 +19,11 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.arrays import Array
 from bcppl.beliefs import Belief
 from bcppl.beliefs.distances import average_distance, average_nearest_distance
 from bcppl.beliefs.regions import (
@@ -51,7 +51,6 @@ MOMENTS = (VISION, *TIMES)
 MASSES = (0.5, 0.9)
 REGIONS = ("translation", "rotation", "pose", "ADD-radius")
 
-Array = npt.NDArray[np.float64]
 Value = TypeVar("Value")
 Task = TypeVar("Task")
 

@@ -12,14 +12,13 @@ import trimesh
 from report import Row, finish, options, show
 from scipy.stats import chi2
 
+from bcppl.arrays import Array
 from bcppl.contact.sensing.intrinsic import IntrinsicSensing
 from bcppl.contact.sensing.location import ContactSensing
 from bcppl.contact.sensing.noise import WrenchNoise, variance_gain
 from bcppl.contact.sensing.surface_posterior import CORNER, EDGE, FACE
 from bcppl.geometry.extrusion import box_peg, round_peg
 from bcppl.geometry.parts import Part
-
-Array = npt.NDArray[np.float64]
 
 LENGTH = 0.08  # m, from the sensor to the tip
 FRICTION = (

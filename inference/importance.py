@@ -34,10 +34,9 @@ from bcppl.errors import InputError
 from bcppl.inference.filters.step import Stepped
 from bcppl.inference.filters.tempering import Tempered
 from bcppl.inference.population import Population
-from bcppl.traces import Series, Trace, generate, propose
+from bcppl.traces import Program, Series, Trace, generate, propose
 from bcppl.traces.values import Value
 
-Program = Callable[..., Any]
 GIVE_STRATA = "give strata as a function that maps a value to its stratum."
 
 

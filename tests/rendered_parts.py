@@ -8,10 +8,9 @@ import torch
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from bcppl.arrays import Array
 from bcppl.geometry.camera import Camera, looking_at
 from bcppl.geometry.parts import Part
-
-Array = npt.NDArray[np.float64]
 
 RING = trimesh.creation.annulus(r_min=0.01, r_max=0.03, height=0.03, sections=64)
 SPHERE = trimesh.creation.icosphere(subdivisions=4, radius=0.03)  # most of its faces are smaller than a pixel

@@ -6,15 +6,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 import torch
 
 from bcppl import poses
+from bcppl.arrays import Array
 from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera, bin_depth, looking_at
-
-Array = npt.NDArray[np.float64]
 
 
 def test_the_point_is_on_the_optical_axis_and_up_is_up() -> None:

@@ -8,12 +8,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 import torch
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from bcppl.arrays import Array
 from bcppl.contact.mujoco_model import ContactParameters
 from bcppl.contact.physics import PegPhysics, Rollout
 from bcppl.contact.sensing.location import ContactSensing
@@ -23,8 +23,6 @@ from bcppl.geometry.outlines import named_outline
 from bcppl.geometry.parts import Part, Piece
 from bcppl.models.parts import insert_peg, insert_tray
 from bcppl.robot.motion import Probe
-
-Array = npt.NDArray[np.float64]
 
 FINE = ContactParameters(time_step=0.0005, friction=0.2, time_constant=0.003)
 COARSE = ContactParameters()

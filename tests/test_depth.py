@@ -6,7 +6,6 @@ import math
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 import pyro
 import pytest
 import torch
@@ -14,13 +13,12 @@ import trimesh
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from bcppl.arrays import Array
 from bcppl.distributions.depth import LaplaceDepth, RobustDepth
 from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera
 from bcppl.geometry.parts import Part
 from bcppl.rendering.ray_casting import RayCaster
-
-Array = npt.NDArray[np.float64]
 
 SCALE, OUTLIER = 0.003, 0.1
 RING = trimesh.creation.annulus(r_min=0.01, r_max=0.03, height=0.03, sections=32)

@@ -7,13 +7,13 @@ import warnings
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 import torch
 import trimesh
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.arrays import Array
 from bcppl.distributions.depth import DepthDistribution, LaplaceDepth, OccludedDepth, RobustDepth
 from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera, looking_at
@@ -21,7 +21,6 @@ from bcppl.geometry.parts import Part
 from bcppl.rendering.ray_casting import RayCaster
 from bcppl.rendering.scene import SceneRenderer, scene_poses
 
-Array = npt.NDArray[np.float64]
 Kind = type[DepthDistribution]
 
 KINDS = [LaplaceDepth, RobustDepth, OccludedDepth]

@@ -6,14 +6,12 @@ import math
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
+from bcppl.arrays import Array
 from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera
 from bcppl.rendering.depth_noise import KINECT, REALSENSE_D435, DepthNoise
-
-Array = npt.NDArray[np.float64]
 
 STILL = np.array([0.0, 0, 0, 1, 0, 0, 0])
 CAMERA = Camera("sensor", 160, 120, 160.0, 160.0, 79.5, 59.5, STILL, near=0.1, far=2.0)

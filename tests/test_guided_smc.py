@@ -28,14 +28,13 @@ from bcppl.inference.filters.smc import Step, smc
 from bcppl.inference.filters.smcp3 import Pair, smcp3
 from bcppl.inference.planning.metrology import three_two_one
 from bcppl.inference.population import Population
-from bcppl.inference.proposals import Program
 from bcppl.inference.resampling import never
 from bcppl.inference.targets import POSTERIOR
 from bcppl.models import look_and_touch
 from bcppl.models.worlds.bench.scene import bench_scene
 from bcppl.poses import Freedom
 from bcppl.sensors.measurements import Recording
-from bcppl.traces import Model, Trace, generate
+from bcppl.traces import Model, Program, Trace, generate
 from tests.checked_pairs import run_checked
 from tests.made_recordings import assert_one_sentence
 
@@ -103,31 +102,28 @@ def redrawn(proposed: NormalPose) -> Program:
 
 
 @dataclass(frozen=True)
-class Programs:
+class Pairs:
     """Forward and backward kernels that draw from posteriors, so many times as wide."""
 
     forward: float = 1.0
     backward: float = 1.0
 
-    def pair(self, before: Exact, after: Exact, action: Any) -> Pair:
+    def __call__(self, before: Exact, after: Exact, action: Any) -> Pair:
         return Pair(redrawn(after.posterior(self.forward)), redrawn(before.posterior(self.backward)))
 
-    def proposals(self, approximation: Exact) -> Sequence[Program]:
-        return ()
 
-
-class NotBack(Programs):
+class NotBack(Pairs):
     """Mutant: a backward kernel that forgets nothing."""
 
-    def pair(self, before: Exact, after: Exact, action: Any) -> Pair:
-        return super().pair(after, after, action)
+    def __call__(self, before: Exact, after: Exact, action: Any) -> Pair:
+        return super().__call__(after, after, action)
 
 
-WIDER, NOT_BACK = Programs(1.6, 1.4), NotBack(1.6, 1.4)
+WIDER, NOT_BACK = Pairs(1.6, 1.4), NotBack(1.6, 1.4)
 
 
-def run(programs: Programs, particles: int, seed: int) -> Iterator[Step]:
-    step = guided(lambda scene: Exact(), programs, kernel("part", programs.proposals))
+def run(pair: Pairs, particles: int, seed: int) -> Iterator[Step]:
+    step = guided(lambda scene: Exact(), pair, kernel("part", lambda approximation: ()))
     return smc(MODEL, RECORDING, step=step, particles=particles, seed=seed)
 
 
@@ -141,8 +137,8 @@ def evidence(count: int = len(SEEN)) -> float:
     return total
 
 
-def test_with_exact_programs_every_weight_is_the_evidence() -> None:
-    steps = list(run(Programs(), particles=40, seed=1))
+def test_with_exact_kernels_every_weight_is_the_evidence() -> None:
+    steps = list(run(Pairs(), particles=40, seed=1))
     for step in steps[1:]:
         assert step.info.log_evidence == pytest.approx(evidence(step.taken), abs=1e-8)
     belief = steps[-1].belief
@@ -152,14 +148,14 @@ def test_with_exact_programs_every_weight_is_the_evidence() -> None:
     assert bool((off.abs() * precision.sqrt() < 5 / math.sqrt(40)).all())
 
 
-def ratios(programs: Programs, runs: int, particles: int = 30) -> np.ndarray:
+def ratios(pairs: Pairs, runs: int, particles: int = 30) -> np.ndarray:
     """Estimated over true evidence, by the pair alone."""
 
     def step(population: Population, observed: Any) -> Any:
         before = Exact() if population.approximation is None else population.approximation
         number = len(observed.args[1]) - 1
         after = before.including(None, number, None, observed.observations)
-        pair = programs.pair(before, after, None)
+        pair = pairs(before, after, None)
         return smcp3(pair, resample=never)(population.with_approximation(after), observed)
 
     estimates = []
@@ -187,13 +183,13 @@ def test_the_whole_step_agrees_with_tempering_and_with_the_truth() -> None:
 
 
 @dataclass(frozen=True)
-class Elsewhere(Programs):
+class Elsewhere(Pairs):
     """A forward kernel of its own, whatever the approximation."""
 
     proposed: Any = None
 
-    def pair(self, before: Exact, after: Exact, action: Any) -> Pair:
-        return replace(super().pair(before, after, action), forward=redrawn(self.proposed))
+    def __call__(self, before: Exact, after: Exact, action: Any) -> Pair:
+        return replace(super().__call__(before, after, action), forward=redrawn(self.proposed))
 
 
 def test_where_a_forward_kernel_misses_the_posterior_the_likelihood_is_tempered() -> None:
@@ -247,7 +243,7 @@ def test_what_all_particles_explain_alike_moves_none_only_far_from_the_part(
     """Near it all may explain it badly. Its evidence counts."""
     count = 20
     model = Model(unrelated, lambda recording: None, observe, "part")
-    step = guided(lambda scene: start(), WIDER, kernel("part", WIDER.proposals))
+    step = guided(lambda scene: start(), WIDER, kernel("part", lambda approximation: ()))
     first, *_, last = smc(model, RECORDING, step=step, particles=count, seed=0)
     assert torch.equal(first.belief.world_from_part, last.belief.world_from_part) == stays
     if stays:

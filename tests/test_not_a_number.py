@@ -23,9 +23,8 @@ from bcppl.inference.filters.guided_smc import Approximation, guided, kernel
 from bcppl.inference.filters.smc import Step, smc
 from bcppl.inference.filters.smcp3 import Pair
 from bcppl.inference.population import Population
-from bcppl.inference.proposals import Program
 from bcppl.poses import Freedom
-from bcppl.traces import Model, Trace, simulate
+from bcppl.traces import Model, Program, Trace, simulate
 
 SLIDING = Freedom("xyz", "none")
 PRIOR, NOISE, SEEN, FAR = 0.02, 0.004, 0.01, 0.3  # metres
@@ -96,11 +95,8 @@ class To:
 
     places: Sequence[Sequence[float]]
 
-    def pair(self, before: Counted, after: Counted, action: Any) -> Pair:
+    def __call__(self, before: Counted, after: Counted, action: Any) -> Pair:
         return Pair(around(self.places[before.count]), around([0.0]))
-
-    def proposals(self, approximation: Counted) -> Sequence[Program]:
-        return ()
 
 
 def run(beyond: Sequence[float | None], places: Sequence[Sequence[float]]) -> Iterator[Step]:
@@ -110,8 +106,8 @@ def run(beyond: Sequence[float | None], places: Sequence[Sequence[float]]) -> It
     def observe(scene: Any, measurements: Sequence[Any]) -> dict[str, Tensor]:
         return {f"seen_{k}": observed for k in range(len(measurements))}
 
-    model, programs = Model(program, lambda recording: beyond, observe, "part"), To(places)
-    step = guided(lambda scene: Counted(), programs, kernel("part", programs.proposals))
+    model = Model(program, lambda recording: beyond, observe, "part")
+    step = guided(lambda scene: Counted(), To(places), kernel("part", lambda approximation: ()))
     return smc(model, RECORDING, step=step, particles=PARTICLES, seed=0)
 
 

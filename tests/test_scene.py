@@ -11,6 +11,7 @@ import torch
 import trimesh
 
 from bcppl import poses
+from bcppl.arrays import Array
 from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera, looking_at
 from bcppl.geometry.parts import Part
@@ -19,8 +20,6 @@ from bcppl.rendering.rasterisation import renderer_for
 from bcppl.rendering.ray_casting import RayCaster
 from bcppl.rendering.scene import SceneRenderer, background_part, scene_poses
 from tests.rendered_parts import part_of
-
-Array = npt.NDArray[np.float64]
 
 CAMERA = Camera(
     "above", 40, 30, 45.0, 47.0, 19.2, 15.1, looking_at((0.2, -0.25, 0.3), (0, 0, 0)), near=0.05, far=2.0

@@ -15,6 +15,7 @@ that many whole ones; the regions of a miscalibrated posterior are miscalibrated
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NamedTuple
@@ -75,7 +76,7 @@ def region(belief: Belief, mass: float, measure: Measure) -> Region:
     distance = measure(belief)
     count = float(1.0 / (belief.weights**2).sum())
     level = mass * (count + 1.0) / count
-    radius = float("inf")
+    radius = math.inf
     if level <= 1.0 + 1e-12:
         radius = _upper(distance.of_particles, belief.weights, min(level, 1.0))
     inside = distance.of(belief.world_from_part) <= radius * (1.0 + 1e-12)

@@ -93,8 +93,9 @@ class Stepper:
                 self.run(begin[k], world_from_part[k], {n: v[k] for n, v in nuisances.items()}, first, last)
                 for k in (slice(at, at + _COPIES) for at in every)
             ]
-            readings, states = zip(*parts, strict=True)
-            return np.concatenate(readings), SimulationState.joined(states)
+            return np.concatenate([rows for rows, _ in parts]), SimulationState.joined(
+                [end for _, end in parts]
+            )
         start, stop = self.step_after(first), self.step_after(last)
         sensed = np.empty((len(begin.state), stop - start, SENSOR_COLUMNS))
         state = begin.state

@@ -12,6 +12,7 @@ A motion is stopped at the sample after two in a row that exceed its force.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Literal, NamedTuple
 
@@ -179,7 +180,7 @@ class Executor:
     def _sunk(self, world_from_peg: Array, time: float) -> float:
         """How far (m) a peg is below its contact with a surface, along the commanded z; infinite without."""
         if self.contact_pose is None:
-            return float("inf")
+            return math.inf
         led = interpolated_command(self.probe, np.array([time]))[0][0]
         along = Rotation.from_quat(led[[4, 5, 6, 3]]).inv()
         return float(along.apply(self.contact_pose[:3] - world_from_peg[:3])[2])

@@ -22,6 +22,7 @@ from bcppl.traces.carried import carried
 from bcppl.traces.checks import Fault, ProgramError, check_program
 from bcppl.traces.differentiation.graph import gradients
 from bcppl.traces.model import Model
+from bcppl.traces.run import Program
 from bcppl.traces.series import Series
 from bcppl.traces.structural import Structure, structural
 from bcppl.traces.trace import Trace
@@ -31,6 +32,7 @@ from bcppl.traces.verbs import Proposed, assess, generate, propose, simulate
 __all__ = [
     "Fault",
     "Model",
+    "Program",
     "ProgramError",
     "Proposed",
     "Regenerated",

@@ -13,6 +13,7 @@ from torch import Tensor
 from bcppl.errors import InputError
 
 Value = Tensor | npt.NDArray[Any] | float
+Values = Mapping[str, Tensor]  # by address
 
 
 def tensors(given: Mapping[str, Value]) -> dict[str, Tensor]:

@@ -18,11 +18,12 @@ from bcppl.arguments import number_within, whole_number
 from bcppl.inference.exponents import exponent_after
 from bcppl.inference.filters.step import StepInfo, Stepped
 from bcppl.inference.kernels import Kernel, Until, moved_by
-from bcppl.inference.kernels.kernel import refuse_other, scattered
+from bcppl.inference.kernels.kernel import refuse_other
 from bcppl.inference.population import Population
 from bcppl.inference.resampling import Scheme, systematic
 from bcppl.inference.targets import POSTERIOR, Target
 from bcppl.traces import Trace, generate
+from bcppl.traces.concatenation import concatenated
 
 
 def persistent_sampling(
@@ -77,7 +78,7 @@ def persistent_sampling(
         acceptances.append(moved.acceptance)
         exponents.append(exponent)
         log_evidences.append(pool.log_evidence)
-        trace = _joined(trace, moved.population.trace)
+        trace = concatenated([trace, moved.population.trace])
         log_likelihood = POSTERIOR.part(trace, addresses)
     log_mixture = _log_mixture(log_likelihood, exponents, log_evidences)
     final = _weighted(trace, log_likelihood, log_mixture, 1.0, log_evidences[-1])
@@ -123,9 +124,3 @@ def _next(log_likelihood: Tensor, log_mixture: Tensor, reached: float, size: flo
         return float(1.0 / weights.square().sum()) >= size
 
     return exponent_after(reached, enough)
-
-
-def _joined(first: Trace, second: Trace) -> Trace:
-    """The particles of two traces of one program, in one."""
-    rows = torch.cat([torch.arange(len(first)), torch.zeros(len(second), dtype=torch.int64)])
-    return scattered(first[rows], torch.arange(len(first), len(rows)), second)

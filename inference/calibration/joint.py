@@ -14,8 +14,8 @@ from bcppl.errors import InputError
 from bcppl.poses import Freedom
 from bcppl.traces import Model, Series, Trace, generate, simulate
 from bcppl.traces.run import Program, run
+from bcppl.traces.values import Values
 
-Values = Mapping[str, Tensor]
 # A test quantity (K,) of latent values (K, *event) by address, and of the data.
 Quantity = Callable[[Values, Any], Tensor]
 

@@ -16,8 +16,9 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.beliefs import Belief
 from bcppl.errors import InputError
-from bcppl.inference.calibration.joint import Simulator, Values
+from bcppl.inference.calibration.joint import Simulator
 from bcppl.poses import Freedom
+from bcppl.traces.values import Values
 
 AXES = ("x", "y", "z", "turn x", "turn y", "turn z")
 PRIOR_DRAWS = 8  # from which reference points are taken in each round

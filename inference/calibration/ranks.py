@@ -9,13 +9,11 @@ from __future__ import annotations
 import functools
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from scipy.stats import binom
 from torch import Tensor
 
-Array = npt.NDArray[np.float64]
-Counts = npt.NDArray[np.int64]
+from bcppl.arrays import Array, Indices
 
 SIMULATIONS = 50_000  # of the statistic under uniform ranks: no p-value is below one in this many
 
@@ -26,7 +24,7 @@ def ranks(truth: Tensor, draws: Tensor) -> Tensor:
     return below + (torch.rand(len(truth), dtype=torch.float64) * (equal + 1)).floor().long()
 
 
-def p_value(ranked: Counts, draws: int) -> float:
+def p_value(ranked: Indices, draws: int) -> float:
     """Of the hypothesis that ranks (K,) are uniform on 0 to L: by the simultaneous band of their ECDF.
 
     The smallest pointwise tail of the empirical distribution function (eq. 13), compared with that of
@@ -59,7 +57,7 @@ def _tails(count: int, draws: int) -> tuple[Array, Array]:
     return np.asarray(low), np.asarray(high)
 
 
-def _gamma(frequencies: Counts) -> Array:
+def _gamma(frequencies: Indices) -> Array:
     """Gamma (...,) of how often each rank came (..., L + 1)."""
     count, draws = int(frequencies.reshape(-1, frequencies.shape[-1])[0].sum()), frequencies.shape[-1] - 1
     low, high = _tails(count, draws)

@@ -11,9 +11,10 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from bcppl.arrays import Array, Indices
 from bcppl.errors import InputError
 from bcppl.inference.calibration.quantities import DENSITY, DISTANCE
-from bcppl.inference.calibration.ranks import Array, Counts, p_value
+from bcppl.inference.calibration.ranks import p_value
 from bcppl.inference.calibration.rounds import Arrays
 
 
@@ -47,7 +48,7 @@ class Calibration:
     """
 
     names: tuple[str, ...]
-    ranks: Counts
+    ranks: Indices
     posterior_draws: int
     truth: Array
     posterior: Array

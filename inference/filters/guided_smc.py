@@ -20,7 +20,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -41,7 +41,7 @@ from bcppl.inference.kernels import Kernel, cycle, metropolis_hastings, sequence
 from bcppl.inference.kernels.kernel import Move
 from bcppl.inference.kernels.rejuvenation import Until, until
 from bcppl.inference.population import Population
-from bcppl.inference.proposals import Program, drift
+from bcppl.inference.proposals import drift
 from bcppl.inference.proposals.approximated import (
     backward_kernel,
     conditional_proposal,
@@ -53,7 +53,7 @@ from bcppl.inference.proposals.approximated import (
 from bcppl.inference.proposals.coordinates import continuous_addresses
 from bcppl.inference.targets import POSTERIOR, runs_physics
 from bcppl.sensors.capabilities import Defers, FitsPose
-from bcppl.traces import Model, Trace, extend
+from bcppl.traces import Model, Program, Trace, extend
 
 WALK = (0.2, 2.0)  # scales of the random walks
 CERTAIN = 0.01  # nats: a log-likelihood as small for all particles carries no information
@@ -67,28 +67,18 @@ SEVERAL = 1800
 DISPLACED, MOST_SWEEPS = 0.5, 6
 
 
-class Programs(Protocol):
-    """The proposals that go with an approximation; `GaussianPrograms` are those of a Gaussian one."""
-
-    def pair(self, before: Any, after: Any, action: Any) -> Pair:
-        """Forward and backward kernels of one measurement."""
-
-    def proposals(self, approximation: Any) -> Sequence[Program]:
-        """Proposals of Metropolis-Hastings moves: one that is made in every sweep, then others."""
+def gaussian_pair(before: Any, after: Any, action: Any) -> Pair:
+    """Forward and backward kernels of one measurement, of Gaussian approximations without and with it."""
+    return Pair(forward_kernel(before, after, action), backward_kernel(before, after, action))
 
 
-class GaussianPrograms:
-    """The proposals of a Gaussian approximation."""
-
-    def pair(self, before: Any, after: Any, action: Any) -> Pair:  # noqa: D102
-        return Pair(forward_kernel(before, after, action), backward_kernel(before, after, action))
-
-    def proposals(self, approximation: Any) -> Sequence[Program]:  # noqa: D102
-        return (
-            joint_proposal(approximation),
-            conditional_proposal(approximation),
-            joint_random_walk(approximation),
-        )
+def gaussian_proposals(approximation: Any) -> Sequence[Program]:
+    """Proposals of Metropolis-Hastings moves: one that is made in every sweep, then others."""
+    return (
+        joint_proposal(approximation),
+        conditional_proposal(approximation),
+        joint_random_walk(approximation),
+    )
 
 
 def kernel(pose: str, proposals: Callable[[Any], Sequence[Program]], *, screen: bool = True) -> Kernel:
@@ -120,7 +110,7 @@ def _one_of(kernels: Sequence[Kernel]) -> list[Kernel]:
 
 def guided(
     start: Callable[[Any], Approximation],
-    programs: Programs,
+    pair: Callable[[Any, Any, Any], Pair],
     moves: Kernel,
     *,
     sweeps: int | Until = 1,
@@ -132,7 +122,7 @@ def guided(
 
     Args:
         start: the approximation before any measurement, given the program's first argument.
-        programs: the kernels and proposals that go with it.
+        pair: the kernels of one measurement, given the approximations without and with it and the action.
         moves: of every particle after each step.
         sweeps: how many of them, or `until(...)`.
         threshold: particles are resampled below this effective sample size, as a share of N.
@@ -165,11 +155,11 @@ def guided(
         after = before.including(scene, len(actions) - 1, action, values)
         population = population.with_approximation(after)
         least = math.ceil(SEVERAL / len(population)) if after.is_ambiguous else 1
-        pair = programs.pair(before, after, action)
+        kernels = pair(before, after, action)
         if screen and after.screens(action):
-            assimilated = assimilate_screened(population, before, observed, pair)
+            assimilated = assimilate_screened(population, before, observed, kernels)
         else:
-            assimilated = assimilate(population, observed, pair, least)
+            assimilated = assimilate(population, observed, kernels, least)
         if assimilated is None:
             return settled(by_tempering(population, observed), population.trace)
         moved, ancestors, acceptance, displaced = rejuvenation(assimilated.population, POSTERIOR)
@@ -240,7 +230,7 @@ def _info(
         ancestors = assimilated.origin if ancestors is None else assimilated.origin[ancestors]
     reached = after.effective_sample_size if assimilated is None else assimilated.effective
     return StepInfo(
-        acceptance=float("nan") if acceptance is None else acceptance,
+        acceptance=math.nan if acceptance is None else acceptance,
         resampled=int(ancestors is not None),
         effective_sample_size_before=reached,
         effective_sample_size=after.effective_sample_size,
@@ -288,12 +278,11 @@ def infer(
     threshold = number_within(
         "particles are to be resampled below a share of {}", threshold, least=0.0, most=1.0
     )
-    programs = GaussianPrograms()
 
     def gaussian(scene: Any) -> GaussianApproximation:
         return GaussianApproximation(model.pose, moved(scene, HOST))
 
-    moves = kernel(model.pose, programs.proposals, screen=screen)
+    moves = kernel(model.pose, gaussian_proposals, screen=screen)
 
     def refitted(trace: Trace, near: Tensor) -> GaussianApproximation:
         scene, actions = trace.args
@@ -309,7 +298,9 @@ def infer(
         return searched(population, independent_proposal)
 
     times = sweeps or until(displacement=DISPLACED, of=(model.pose,), most=MOST_SWEEPS)
-    step = guided(gaussian, programs, moves, sweeps=times, threshold=threshold, screen=screen, search=search)
+    step = guided(
+        gaussian, gaussian_pair, moves, sweeps=times, threshold=threshold, screen=screen, search=search
+    )
     return smc(
         model, recording, step=step, particles=particles, seed=seed, scene=scene, start=start, device=device
     )

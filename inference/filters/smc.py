@@ -6,6 +6,7 @@ without a recording is run by `bcppl.inference.filters.step.steps`.
 
 from __future__ import annotations
 
+import math
 import time
 import warnings
 from collections.abc import Iterator, Mapping
@@ -270,7 +271,7 @@ def _unchanged(
 
 
 def _prior(model: Model, population: Population, random_state: Tensor) -> Step:
-    belief, nothing = population.belief(model.pose), float("nan")
+    belief, nothing = population.belief(model.pose), math.nan
     happened = StepInfo(exponents=(), effective_sample_size=belief.effective_sample_size)
     evidence, count = population.log_evidence, len(population)
     info = Info("prior", nothing, evidence, count, nothing, 0.0, {}, happened)
@@ -305,7 +306,7 @@ class _Truth:
     def gap(self, population: Population) -> float:
         """Log-likelihood of the truth minus that of the best particle, NaN where the truth is not known."""
         if self.trace is None:
-            return float("nan")
+            return math.nan
         addresses = list(population.trace.observations)
         best = population.trace.log_prob(*addresses)[population.log_weights > -torch.inf].max()
         return float(self.trace.log_prob(*addresses) - best)
@@ -317,4 +318,4 @@ def _effort(scene: Any) -> dict[str, Any]:
 
 def _time(measurement: Any) -> float:
     times = getattr(measurement.observation, "times", None)
-    return float(times[-1]) if times is not None and len(times) else float("nan")
+    return float(times[-1]) if times is not None and len(times) else math.nan

@@ -42,17 +42,16 @@ from bcppl.inference.kernels.jacobian import (
 )
 from bcppl.inference.kernels.kernel import scattered, weighted
 from bcppl.inference.population import Population
-from bcppl.inference.proposals import Fitted, Program, Proposal, program_of
+from bcppl.inference.proposals import Fitted, Proposal, program_of
 from bcppl.inference.resampling import Resample, adaptive, check_resample
-from bcppl.traces import Trace, Update, extend, simulate, update
+from bcppl.traces import Program, Trace, Update, extend, simulate, update
 from bcppl.traces.anticipated import Anticipated
 from bcppl.traces.differentiation.programs import result_with_grad, with_gradients
 from bcppl.traces.series import SeriesTrace
+from bcppl.traces.values import Values
 from bcppl.traces.verbs import assessed
 
 OLD, FORWARD, NEW, BACKWARD = "old value", "forward choice", "new value", "backward choice"
-
-Values = Mapping[str, Tensor]
 
 
 @dataclass(frozen=True)

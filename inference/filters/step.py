@@ -10,6 +10,7 @@ Any program can be run so, without a recording:
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
 from typing import Any, NamedTuple
 
@@ -52,14 +53,14 @@ class StepInfo(NamedTuple):
             the axis on which it is least; NaN without resampling, or without `until(displacement=...)`.
     """
 
-    acceptance: float = float("nan")
+    acceptance: float = math.nan
     exponents: tuple[float, ...] = (1.0,)
     resampled: int = 0
-    effective_sample_size_before: float = float("nan")
-    effective_sample_size: float = float("nan")
+    effective_sample_size_before: float = math.nan
+    effective_sample_size: float = math.nan
     log_evidence: float = 0.0
     ancestors: Tensor | None = None
-    displacement: float = float("nan")
+    displacement: float = math.nan
 
     def __repr__(self) -> str:
         shown = {name: f"{value:.4g}" for name, value in self._asdict().items() if isinstance(value, float)}

@@ -35,12 +35,12 @@ from bcppl.inference.filters.tempering import tempered
 from bcppl.inference.kernels import Kernel, Until, metropolis_hastings, mixture, sequence, until
 from bcppl.inference.kernels.kernel import Move, takes
 from bcppl.inference.population import Population
-from bcppl.inference.proposals import Program, drift, independent, prior, spread_of
+from bcppl.inference.proposals import drift, independent, prior, spread_of
 from bcppl.inference.proposals.climbing import Modes, jumps, modes
 from bcppl.inference.proposals.coordinates import continuous_addresses
 from bcppl.inference.proposals.walk import joint_drift
 from bcppl.inference.targets import runs_physics
-from bcppl.traces import Model, Series, Trace, generate
+from bcppl.traces import Model, Program, Series, Trace, generate
 
 
 def kernel(

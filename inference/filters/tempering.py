@@ -13,9 +13,10 @@ that contains a surrogate likelihood is a surrogate's.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -38,7 +39,7 @@ class Rejuvenated(NamedTuple):
     population: Population
     ancestors: Tensor | None
     acceptance: float | None
-    displacement: float = float("nan")
+    displacement: float = math.nan
 
 
 # Resamples if it sees need, and moves the particles towards a target that they are weighted for.
@@ -80,26 +81,60 @@ def ratio_of_old_sites(longer: Trace, new: Sequence[str], log_weight: Tensor) ->
     return torch.where(own == -torch.inf, 0.0, log_weight - own)
 
 
-def _where_left(share: float | Callable[[Trace], float]) -> Resample:
+Share = Callable[[Trace], float]
+
+
+def share_of(share: float | Share) -> Share:
+    """A share that is a number or a function of the trace, as such a function."""
+    if callable(share):
+        return lambda trace: kept_share(share(trace))
+    kept = kept_share(share)
+    return lambda trace: kept
+
+
+def where_left(share: Share) -> Resample:
     """Systematic resampling wherever exponents leave no more than a share of the effective sample size."""
 
     def resample(population: Population) -> tuple[Population, Tensor | None]:
-        kept = kept_share(share(population.trace)) if callable(share) else share
-        return adaptive(systematic, resampled_below(kept))(population)
+        return adaptive(systematic, resampled_below(share(population.trace)))(population)
 
     return resample
 
 
-class _Schedule(NamedTuple):
-    share: float | Callable[[Trace], float]
-    fixed: tuple[float, ...] | None
+class Schedule(NamedTuple):
+    """Which exponents: those that keep a share of the conditional effective sample size, or fixed ones."""
 
-    def after(self, reached: float, population: Population, log_likelihood: Tensor) -> float:
+    share: Share
+    fixed: tuple[float, ...] | None = None
+
+    def after(self, reached: float, population: Population, log_ratio: Tensor) -> float:
         """The exponent that follows `reached`."""
         if self.fixed is not None:
             return next(e for e in self.fixed if e > reached)
-        kept = kept_share(self.share(population.trace)) if callable(self.share) else self.share
-        return next_exponent(population.log_weights, log_likelihood, reached, kept)
+        return next_exponent(population.log_weights, log_ratio, reached, self.share(population.trace))
+
+
+class Path(NamedTuple):
+    """Densities p^(1 - e) q^e from p, at e = 0, to q, at e = 1.
+
+    Attributes:
+        log_ratio: log q / p (N,) of a trace.
+        target: moves at an exponent e > 0 leave it invariant.
+    """
+
+    log_ratio: Callable[[Trace], Tensor]
+    target: Callable[[float], Any]
+
+
+def _likelihood_path(group: Sequence[str], later: Sequence[Sequence[str]]) -> Path:
+    """Tempering of some sites, while those of later groups do not count."""
+    left_out = {address: 0.0 for others in later for address in others}
+
+    def target(exponent: float) -> Target:
+        partly = {**left_out, **(dict.fromkeys(group, exponent) if exponent < 1.0 else {})}
+        return Target(partly) if partly else POSTERIOR
+
+    return Path(lambda trace: POSTERIOR.part(trace, group), target)
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +142,7 @@ class Tempered:
     """A step that tempers: see `tempered`, which makes it."""
 
     rejuvenation: Rejuvenation
-    schedule: _Schedule
+    schedule: Schedule
     by_site: bool = False
 
     def __call__(self, population: Population, observed: Observed) -> Stepped:
@@ -127,26 +162,32 @@ class Tempered:
             population: weighed for all other sites.
             new: addresses of the sites; none of them is latent.
         """
-        start = population.log_evidence
         sites = population.trace.distributions
         ordered = sorted(new, key=lambda address: cost_of(sites[address]))
         groups = [[a] for a in ordered] if self.by_site and new else [list(new)]
+        return self.along(
+            [_likelihood_path(group, groups[k + 1 :]) for k, group in enumerate(groups)], population
+        )
+
+    def along(self, paths: Sequence[Path], population: Population) -> Stepped:
+        """Weigh and move particles along paths of densities, one after another.
+
+        Args:
+            paths: each begins where the one before ends.
+            population: weighted for the first density of the first path.
+        """
+        start = population.log_evidence
         done, acceptances, ancestors, before, resampled = [], [], None, None, 0
-        displacement = float("nan")
-        for number, group in enumerate(groups):
-            later = {a: 0.0 for others in groups[number + 1 :] for a in others}
-            exponent = 0.0
-            log_likelihood = POSTERIOR.part(population.trace, group)
+        displacement = math.nan
+        for path in paths:
+            exponent, log_ratio = 0.0, path.log_ratio(population.trace)
             while exponent < 1.0:
                 reached = exponent
-                exponent = self.schedule.after(reached, population, log_likelihood)
+                exponent = self.schedule.after(reached, population, log_ratio)
                 done.append(exponent)
                 # 0 times -inf is no number, so a particle that cannot be loses its weight here, once.
-                population = weighed = population.reweighed((exponent - reached) * log_likelihood)
-                partly = {**later, **(dict.fromkeys(group, exponent) if exponent < 1.0 else {})}
-                population, chosen, acceptance, come = self.rejuvenation(
-                    population, Target(partly) if partly else POSTERIOR
-                )
+                population = weighed = population.reweighed((exponent - reached) * log_ratio)
+                population, chosen, acceptance, come = self.rejuvenation(population, path.target(exponent))
                 if chosen is not None:
                     displacement = come
                     resampled += 1
@@ -155,9 +196,9 @@ class Tempered:
                 if acceptance is not None:
                     acceptances.append(acceptance)
                 if exponent < 1.0:
-                    log_likelihood = POSTERIOR.part(population.trace, group)
+                    log_ratio = path.log_ratio(population.trace)
         info = StepInfo(
-            sum(acceptances) / len(acceptances) if acceptances else float("nan"),
+            sum(acceptances) / len(acceptances) if acceptances else math.nan,
             tuple(done),
             resampled,
             population.effective_sample_size if before is None else before,
@@ -213,8 +254,7 @@ def tempered(
     """
     if kernel is not None:
         refuse_other("tempered", kernel)
-    if not callable(share):
-        share = kept_share(share)
+    kept = share_of(share)
     if not callable(sweeps) and not isinstance(sweeps, Until):
         # Without moves there is no kernel: None.
         sweeps = whole_number("tempering is to move the particles in {} sweeps", sweeps)
@@ -222,10 +262,10 @@ def tempered(
     if resample is not None:
         check_resample("tempered", resample)
     if rejuvenation is None:
-        default = _where_left(0.0 if fixed is not None else share)
+        default = where_left(kept if fixed is None else share_of(0.0))
         rejuvenation = resample_move(kernel, sweeps, default if resample is None else resample, always_move)
     elif kernel is not None or resample is not None:
         raise InputError(
             "a step is given a rejuvenation beside a kernel or a resampling; give one or the other."
         )
-    return Tempered(rejuvenation, _Schedule(share, fixed), by_site)
+    return Tempered(rejuvenation, Schedule(kept, fixed), by_site)

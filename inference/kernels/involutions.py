@@ -23,8 +23,8 @@ from bcppl.inference.population import Population
 from bcppl.inference.proposals.proposal import Proposal, program_of
 from bcppl.inference.targets import Target, visible
 from bcppl.traces import Trace, assess, simulate, update
+from bcppl.traces.values import Values
 
-Values = Mapping[str, Tensor]
 Involution = Callable[[Values, Values], tuple[Values, Values]]
 
 

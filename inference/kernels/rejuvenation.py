@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -33,7 +34,7 @@ class Moved(NamedTuple):
 
     population: Population
     acceptance: float
-    displacement: float = float("nan")
+    displacement: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -153,7 +154,7 @@ def moved_by(population: Population, kernel: Kernel, target: Target, sweeps: int
         population, accepted = _sweep(population, kernel, target)
         shares.append(accepted)
         made += 1
-    acceptance = float(torch.cat(shares).mean()) if shares else float("nan")
+    acceptance = float(torch.cat(shares).mean()) if shares else math.nan
     if not isinstance(sweeps, Until) or sweeps.displacement is None:
         return Moved(population, acceptance)
     return Moved(population, acceptance, float(sweeps.displaced(start, population).min()))

@@ -16,17 +16,20 @@ from torch import Tensor
 
 from bcppl.arguments import whole_number
 from bcppl.errors import InputError
-from bcppl.inference.exponents import next_exponent, resampled_below
-from bcppl.inference.filters.step import StepInfo, Stepped
-from bcppl.inference.filters.tempering import kept_share
-from bcppl.inference.kernels import Kernel, Until, moved_by
+from bcppl.inference.filters.step import Stepped
+from bcppl.inference.filters.tempering import (
+    Path,
+    Schedule,
+    Tempered,
+    resample_move,
+    share_of,
+    where_left,
+)
+from bcppl.inference.kernels import Kernel, Until
 from bcppl.inference.kernels.kernel import refuse_other
 from bcppl.inference.population import Population
-from bcppl.inference.resampling import adaptive
 from bcppl.inference.targets import POSTERIOR
-from bcppl.traces import Trace, assess, generate, propose
-
-Program = Callable[..., Any]
+from bcppl.traces import Program, Trace, assess, generate, propose
 
 
 @dataclass(frozen=True)
@@ -76,7 +79,7 @@ def bridged(
             what `importance_sampling` refuses.
     """
     refuse_other("bridged", kernel)
-    share = kept_share(share)
+    kept = share_of(share)
     if not isinstance(sweeps, Until):
         sweeps = whole_number("bridging is to move the particles in {} sweeps", sweeps)
     proposed = propose(proposal, args, particles)
@@ -84,36 +87,12 @@ def bridged(
         raise InputError("a proposal for bridging samples no address; temper from the prior instead.")
     trace, _ = generate(program, args, observations, particles, proposed.choices)
     start = _Start(proposal, args, tuple(proposed.choices))
-    population = Population(trace)
-    ratio, exponents, acceptances, resampled = trace.log_prob() - start(trace), [0.0], [], 0
-    resample = adaptive(threshold=resampled_below(share))
-    ancestors, before = None, float("nan")
-    while exponents[-1] < 1.0:
-        last = exponents[-1]
-        exponent = 1.0 if share <= 0.0 else next_exponent(population.log_weights, ratio, last, share)
-        exponents.append(exponent)
-        weighed = population.reweighed((exponent - last) * ratio)
-        population, chosen = resample(weighed)
-        if chosen is not None:
-            target: Any = Bridge(start, exponent) if exponent < 1.0 else POSTERIOR
-            resampled, before = resampled + 1, weighed.effective_sample_size
-            ancestors = chosen if ancestors is None else ancestors[chosen]
-            moved = moved_by(population, kernel, target, sweeps)
-            population = moved.population
-            acceptances.append(moved.acceptance)
-        if exponent < 1.0:
-            ratio = population.trace.log_prob() - start(population.trace)
-    size = population.effective_sample_size
-    info = StepInfo(
-        sum(acceptances) / len(acceptances) if acceptances else float("nan"),
-        tuple(exponents[1:]),
-        resampled,
-        before if resampled else size,
-        size,
-        population.log_evidence,
-        ancestors,
+    path = Path(
+        lambda trace: trace.log_prob() - start(trace),
+        lambda exponent: Bridge(start, exponent) if exponent < 1.0 else POSTERIOR,
     )
-    return Stepped(population, info)
+    step = Tempered(resample_move(kernel, sweeps, where_left(kept)), Schedule(kept))
+    return step.along([path], Population(trace))
 
 
 @dataclass(frozen=True)

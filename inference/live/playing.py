@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator
 
@@ -26,7 +27,7 @@ def play(
     Raises:
         InputError: the speed is not positive.
     """
-    if speed != float("inf"):
+    if speed != math.inf:
         number_within("a recording is to be played at {} times its speed", speed, above=0.0)
 
     def playing() -> Iterator[Measurement]:

@@ -12,7 +12,7 @@ import torch
 
 from bcppl import poses
 from bcppl.arguments import whole_number
-from bcppl.arrays import Array
+from bcppl.arrays import Array, Mask
 from bcppl.beliefs import Belief
 from bcppl.contact.physics import PegPhysics, Rollout
 from bcppl.geometry.holes import Hole, depth_reached, hole_of, lateral_error
@@ -20,8 +20,6 @@ from bcppl.geometry.parts import Part
 from bcppl.inference.planning.waypoints import tip_of
 from bcppl.inference.resampling import seeded, systematic
 from bcppl.robot.plan import InsertionPlan, Plan, probe_of
-
-Mask = npt.NDArray[np.bool_]
 
 _BESIDE = 0.002  # m: a tip farther from the hole's axis is not in the hole
 _AT_ONCE = 50  # stamps that are simulated before particles whose search has ended are left out

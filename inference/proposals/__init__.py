@@ -26,7 +26,6 @@ from bcppl.inference.proposals.depth_points import depth_alignment as depth_alig
 from bcppl.inference.proposals.differences import differential_evolution as differential_evolution
 from bcppl.inference.proposals.proposal import (
     Fitted as Fitted,
-    Program as Program,
     Proposal as Proposal,
     program_of as program_of,
 )

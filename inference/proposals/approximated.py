@@ -20,9 +20,8 @@ from bcppl.devices import beside
 from bcppl.distributions.pose_normals import GaussianMixture, transport, widened_mixture
 from bcppl.distributions.poses import MixturePose, NormalPose, NormalTwist
 from bcppl.inference.approximations.gaussian import GaussianApproximation
-from bcppl.inference.proposals.proposal import Program
 from bcppl.sensors.capabilities import FitsPose
-from bcppl.traces import Trace
+from bcppl.traces import Program, Trace
 
 # Correlations of standardised deviations before and after a proposal: of the part, of nuisance parameters
 # that follow it to anywhere, and of those in a random walk.

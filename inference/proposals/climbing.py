@@ -25,11 +25,10 @@ from bcppl.inference.proposals.coordinates import PoseCoordinates
 from bcppl.inference.proposals.depth_points import depth_aligned
 from bcppl.inference.proposals.least_squares import Alignment
 from bcppl.inference.proposals.onset_points import onsets, onsets_aligned
-from bcppl.inference.proposals.proposal import Program
 from bcppl.inference.proposals.spread import conditioned
 from bcppl.inference.summaries import weighted_covariance
 from bcppl.poses import FREE
-from bcppl.traces import Trace
+from bcppl.traces import Program, Trace
 
 ALIGNMENTS = 4  # of every climber, of two steps each
 WALKERS, STEPS = 24, 80  # the climbers that go on by small steps, and how many steps they try

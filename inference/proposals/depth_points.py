@@ -13,7 +13,7 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.arguments import number_within, whole_number
-from bcppl.arrays import Array
+from bcppl.arrays import Array, Indices
 from bcppl.distributions.depth import ClutteredDepth, LaplaceDepth, RobustDepth
 from bcppl.distributions.support import freedom_of
 from bcppl.errors import InputError
@@ -30,8 +30,6 @@ from bcppl.inference.proposals.proposal import Fitted
 from bcppl.poses import FREE, Freedom
 from bcppl.rendering.part_renderer import Hits
 from bcppl.traces import Trace
-
-Ids = npt.NDArray[np.int64]
 
 FARTHEST = 10.0  # the largest scale of residuals, in scales of the depth's noise
 ENOUGH = 200  # pixels of an image, for each particle: more hardly change the step
@@ -138,7 +136,9 @@ def _thinned(hits: Hits, particles: int) -> tuple[Hits, Array]:
     return thinned, stride.astype(np.float64)
 
 
-def _scales(error: Array, known: npt.NDArray[np.bool_], particle: Ids, particles: int, noise: float) -> Array:
+def _scales(
+    error: Array, known: npt.NDArray[np.bool_], particle: Indices, particles: int, noise: float
+) -> Array:
     """Each particle's robust scale of the errors (N,), from their median absolute value, clipped."""
     size = np.where(known, np.abs(error), np.inf)
     order = np.lexsort((size, particle))

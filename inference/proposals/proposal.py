@@ -14,8 +14,7 @@ from typing import Any
 
 from bcppl.errors import InputError
 from bcppl.inference.population import Population
-
-Program = Callable[..., Any]
+from bcppl.traces import Program
 
 
 @dataclass(frozen=True)

@@ -20,14 +20,13 @@ import torch
 from torch import Tensor
 
 from bcppl.errors import InputError
-from bcppl.inference.filters.smcp3 import Values
 from bcppl.inference.population import Population
-from bcppl.inference.proposals import Program
 from bcppl.inference.structures.moves import MovedStrata, StrataMove
 from bcppl.inference.structures.strata import Strata
 from bcppl.inference.structures.translation import sampling_nothing, translated
 from bcppl.inference.targets import Target
-from bcppl.traces import Structure, Trace
+from bcppl.traces import Program, Structure, Trace
+from bcppl.traces.values import Values
 
 Change = Callable[[Structure], Mapping[str, int] | None]
 

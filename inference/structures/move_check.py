@@ -7,6 +7,7 @@ together, moved, must remain such draws. Each is compared with itself.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -82,7 +83,7 @@ def check_move(
     ordered = before.sort(dim=0).values.T.contiguous()
     structures = sorted(start.populations, key=lambda s: -len(start.populations[s]))[:MOST]
     change = _quantities(strata, now, ordered, structures) - _quantities(start, before, ordered, structures)
-    return KernelCheck(check_change(change), sum(shares) / len(shares) if shares else float("nan"))
+    return KernelCheck(check_change(change), sum(shares) / len(shares) if shares else math.nan)
 
 
 def _of(strata: Strata, address: str) -> Tensor:

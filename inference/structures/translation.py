@@ -31,7 +31,6 @@ from bcppl.inference.filters.smcp3 import (
     FORWARD,
     NEW,
     OLD,
-    Values,
     refuse_observed_choices,
     refuse_other_choices,
 )
@@ -45,10 +44,9 @@ from bcppl.inference.kernels.jacobian import (
     refuse_unequal,
 )
 from bcppl.inference.population import Population
-from bcppl.inference.proposals import Program
-from bcppl.traces import Trace, generate, simulate
+from bcppl.traces import Program, Trace, generate, simulate
 from bcppl.traces.differentiation.programs import result_with_grad, with_gradients
-from bcppl.traces.values import shapes
+from bcppl.traces.values import Values, shapes
 from bcppl.traces.verbs import assessed
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -94,7 +95,7 @@ def insert(
     searched = [t for k, t in search.stops.items() if plan.search.manners[k] == "searching"]
     return InsertionResult(
         inserted=bool(depth >= plan.deep_enough and beside < _BESIDE),
-        found_at=searched[0] if searched else float("nan"),
+        found_at=searched[0] if searched else math.nan,
         depth=depth,
         peak_force=float(force.max()),
         sustained_force=float(np.minimum(force[1:], force[:-1]).max()),

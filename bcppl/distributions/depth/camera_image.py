@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import torch
 from torch import Tensor
 
-from bcppl.distributions.depth.rendering import Mask, RendersDepth
+from bcppl.arrays import Mask
+from bcppl.distributions.depth.rendering import RendersDepth
 from bcppl.distributions.lazy import LazyDistribution
 from bcppl.distributions.parameters import check_shape
 from bcppl.errors import InputError

@@ -15,11 +15,11 @@ from scipy.special import betainc
 from torch import Tensor
 from torch.utils.weak import WeakTensorKeyDictionary
 
+from bcppl.arrays import Array, Mask
 from bcppl.distributions.checks import Check
 from bcppl.distributions.depth.camera_image import CameraImage
 from bcppl.distributions.depth.noise import RobustDepth
 from bcppl.distributions.depth.observed import Observed
-from bcppl.distributions.depth.rendering import Array, Mask
 from bcppl.distributions.depth.scanlines import Chain, Line, Lines, draw, gains, scan
 from bcppl.distributions.parameters import COUNT, POSITIVE, PROBABILITY, within
 

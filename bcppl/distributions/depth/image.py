@@ -17,12 +17,13 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.arguments import number_within
+from bcppl.arrays import Array
 from bcppl.devices import beside, is_on_host, numbers
 from bcppl.distributions.checks import Check
 from bcppl.distributions.depth.camera_image import CameraImage
 from bcppl.distributions.depth.observed import CACHE, Observed
 from bcppl.distributions.depth.pixels import PixelLaw, Pixels, log_densities, sum_gains
-from bcppl.distributions.depth.rendering import Array, CachedHits
+from bcppl.distributions.depth.rendering import CachedHits
 from bcppl.distributions.parameters import IF_GIVEN, POSITIVE, ranges
 from bcppl.errors import InputError
 from bcppl.threads import parallel_sum, thread_count

@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 from torch.utils.weak import WeakTensorKeyDictionary
 
+from bcppl.arrays import Array, Mask
 from bcppl.distributions.depth.pixels import PixelLaw, log_totals
-from bcppl.distributions.depth.rendering import Array, Mask
 from bcppl.errors import InputError
 
 MOST_TOTALS = 100_000  # biases whose totals are cached

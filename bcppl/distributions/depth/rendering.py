@@ -9,11 +9,10 @@ import numpy as np
 import numpy.typing as npt
 from torch import Tensor
 
+from bcppl.arrays import Array, Mask
+
 if TYPE_CHECKING:
     from bcppl.geometry.camera import Camera
-
-Array = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
 
 
 class PixelHits(Protocol):

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, TypeVar, cast
 import numpy as np
 from numba import njit
 
-from bcppl.distributions.depth.rendering import Array, Mask
+from bcppl.arrays import Array, Mask
 
 F = TypeVar("F", bound=Callable[..., Any])
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple, Protocol
@@ -85,7 +86,7 @@ def _noise_of(place: Array) -> float:
     A motion that is not smooth over three stamps adds to it.
     """
     if len(place) < 10:
-        return float("inf")
+        return math.inf
     return float(np.median(np.abs(np.diff(place, n=2, axis=0)))) / (0.6745 * 6.0**0.5)
 
 
