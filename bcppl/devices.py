@@ -102,13 +102,13 @@ def numbers(tensor: Tensor) -> npt.NDArray[Any]:
     return np.asarray((tensor if is_on_host(tensor) else tensor.detach().cpu()).numpy())
 
 
-def beside(values: npt.NDArray[Any] | Tensor, other: Tensor) -> Tensor:
+def on_device_of(values: npt.NDArray[Any] | Tensor, other: Tensor) -> Tensor:
     """The numbers on the device of another tensor; not copied where that is the host."""
     tensor = torch.from_numpy(values) if isinstance(values, np.ndarray) else values
     return tensor if tensor.device == other.device else tensor.to(other.device)
 
 
-def moved(value: T, device: torch.device) -> T:
+def to_device(value: T, device: torch.device) -> T:
     """A value whose tensors are on a device: a tensor, or what holds some.
 
     That is a tuple or mapping of such values, or an object with a method `on`, which is given the device;
@@ -118,10 +118,10 @@ def moved(value: T, device: torch.device) -> T:
     if isinstance(value, Tensor):
         result = value if value.device == device else value.to(device)
     elif isinstance(value, tuple):
-        each = [moved(one, device) for one in value]
+        each = [to_device(one, device) for one in value]
         result = value._make(each) if hasattr(value, "_make") else tuple(each)
     elif isinstance(value, Mapping):
-        result = {name: moved(one, device) for name, one in value.items()}
+        result = {name: to_device(one, device) for name, one in value.items()}
     elif hasattr(value, "on"):
         result = value.on(device)
     return cast(T, result)

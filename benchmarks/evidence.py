@@ -23,7 +23,7 @@ from bcppl.beliefs import normalised
 from bcppl.distributions.lazy import LazyDistribution
 from bcppl.inference.filters.step import Observed
 from bcppl.inference.filters.tempering import tempered
-from bcppl.inference.kernels import Kernel, distinct
+from bcppl.inference.kernels import Kernel
 from bcppl.inference.population import Population
 from bcppl.inference.resampling import adaptive, systematic
 from bcppl.traces import generate
@@ -165,7 +165,7 @@ def run(problem: Problem, method: Method, particles: int, seed: int) -> Outcome:
         Counted.calls,
         seconds,
         len(done.info.exponents),
-        distinct(population),
+        population.distinct,
         (mean / problem.spread).tolist(),
     )
 

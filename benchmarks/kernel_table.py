@@ -22,7 +22,7 @@ from bcppl.inference.kernels import (
     sequence,
 )
 from bcppl.inference.proposals import (
-    Fitted,
+    Fittable,
     differential_evolution,
     drift,
     independent,
@@ -60,7 +60,7 @@ def reflected(address: str) -> Kernel:
         return {address: values[address] + choices["step"]}, {"step": -choices["step"]}
 
     learn = spread_of(address)
-    program = Fitted(lambda population: partial(step, spread=learn(population)))
+    program = Fittable(lambda population: partial(step, spread=learn(population)))
     return involutive(program, turn)
 
 

@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 
 from bcppl.errors import InputError
-from bcppl.inference import kernels, summaries
+from bcppl.inference import summaries
 
 S = TypeVar("S")
 
@@ -96,7 +96,7 @@ def acceptance(step: Any) -> float:
 
 def distinct(step: Any) -> int:
     """The number of particles that differ in some latent value."""
-    return kernels.distinct(step.population)
+    return int(step.population.distinct)
 
 
 def mean(address: str) -> Callable[[Any], Tensor]:

@@ -13,14 +13,14 @@ from torch import Tensor
 from bcppl.arguments import latent_address
 from bcppl.beliefs import Belief, normalised
 from bcppl.beliefs.belief import ApparentPose, SeesPart
-from bcppl.devices import HOST, moved
+from bcppl.devices import HOST, to_device
 from bcppl.distributions.support import refuse_several_poses
 from bcppl.errors import InferenceError, InputError, OtherKindError
 from bcppl.inference.ancestry import inherited
 from bcppl.poses import FREE
 from bcppl.traces import Trace
 from bcppl.traces.indexing import Index, particles_at
-from bcppl.traces.verbs import at_device
+from bcppl.traces.verbs import trace_to_device
 
 EQUAL = torch.empty(0, dtype=torch.float64)  # in place of log weights: all are equal
 
@@ -129,7 +129,7 @@ class Population:
         own = {name: self.__dict__[name] for name in ("log_weights", "founders", "families", "sides")}
         if self.log_weights.device == device:
             return self
-        return self._with(trace=at_device(self.trace, device), **moved(own, device))
+        return self._with(trace=trace_to_device(self.trace, device), **to_device(own, device))
 
     def with_approximation(self, approximation: Any) -> Population:
         """The same particles with another approximation of their posterior."""
@@ -234,7 +234,7 @@ class Population:
                 f"{tuple(poses.shape[1:])}; use bcppl.inference.summaries."
             )
         # What people read is on the host, wherever the particles are.
-        poses, log_weights = moved((poses, self.log_weights), HOST)
+        poses, log_weights = to_device((poses, self.log_weights), HOST)
         return Belief(poses, log_weights, freedom or FREE, self.apparent_pose(address))
 
     def apparent_pose(self, address: str) -> ApparentPose | None:

@@ -19,7 +19,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from bcppl.errors import InputError
-from bcppl.inference.filters.smcp3 import Pair, moved
+from bcppl.inference.filters.smcp3 import Pair, move_and_weight
 from bcppl.inference.filters.step import Observed
 from bcppl.inference.importance import importance_sampling
 from bcppl.inference.kernels import Kernel, Until, moved_by
@@ -100,7 +100,7 @@ def update(population: Population, observed: Observed, pair: Pair | None = None)
     """
     refuse_no_population("update", population)
     if pair is not None:
-        return moved(population, pair, observed)
+        return move_and_weight(population, pair, observed)
     trace, log_likelihood = extend(population.trace, *observed)
     return population.with_trace(trace).reweighed(log_likelihood)
 

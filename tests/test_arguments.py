@@ -18,7 +18,7 @@ from bcppl.arguments import number_within, seed_number, whole_number
 from bcppl.distributions.poses import SwingTwistPose, UniformPose
 from bcppl.errors import InputError
 from bcppl.inference.chains import markov_chains
-from bcppl.inference.filters.smcp3 import Pair, moved, smcp3
+from bcppl.inference.filters.smcp3 import Pair, move_and_weight, smcp3
 from bcppl.inference.filters.tempering import tempered
 from bcppl.inference.filters.waste_free import waste_free_moves
 from bcppl.inference.importance import generate_stratified, importance_sampling
@@ -225,7 +225,7 @@ def test_an_observed_address_is_not_for_a_proposal() -> None:
     with pytest.raises(InputError, match="a proposal samples 'y', which is observed"):
         moved_by(population(), metropolis_hastings(both), POSTERIOR)
     with pytest.raises(InputError, match="the forward program of a pair samples 'y', which is observed"):
-        moved(population(), Pair(both, both))
+        move_and_weight(population(), Pair(both, both))
 
 
 def test_several_poses_at_one_address_are_refused_at_once() -> None:

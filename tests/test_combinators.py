@@ -19,7 +19,6 @@ from bcppl.inference.kernels import (
     Move,
     cycle,
     displacement,
-    distinct,
     metropolis_hastings,
     mixture,
     moved_by,
@@ -206,10 +205,10 @@ def counted(kernel: Kernel) -> tuple[Kernel, list[int]]:
 def test_sweeps_until_particles_differ() -> None:
     torch.manual_seed(3)
     population = copies(40, 4)
-    assert distinct(population) == 4
+    assert population.distinct == 4
     kernel, calls = counted(SHORT)
     done = moved_by(population, kernel, POSTERIOR, until(distinct=30)).population
-    assert distinct(done) >= 30
+    assert done.distinct >= 30
     assert 2 <= len(calls) <= 20
     calls.clear()
     assert moved_by(done, kernel, POSTERIOR, until(distinct=30)).population is done

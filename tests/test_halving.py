@@ -14,10 +14,10 @@ import torch
 from torch import Tensor
 
 from bcppl.inference import Population, markov_chains, replicate, resample, resize
-from bcppl.inference.filters.smcp3 import Pair, moved
+from bcppl.inference.filters.smcp3 import Pair, move_and_weight
 from bcppl.inference.filters.waste_free import waste_free_moves
 from bcppl.inference.kernels import Kernel, halved, halves, metropolis_hastings, moved_by
-from bcppl.inference.proposals import Fitted, drift, independent
+from bcppl.inference.proposals import Fittable, drift, independent
 from bcppl.inference.resampling import systematic
 from bcppl.inference.targets import POSTERIOR
 from bcppl.traces import Trace, simulate
@@ -164,7 +164,7 @@ class Spied:
     def __init__(self) -> None:
         self.learned: list[set[float]] = []
         self.moved: list[set[float]] = []
-        self.proposal = Fitted(self.fit)
+        self.proposal = Fittable(self.fit)
 
     def fit(self, population: Population) -> Callable[[Trace], None]:
         learned = set(population["x"][:, 0].tolist())
@@ -177,20 +177,20 @@ class Spied:
         return walk
 
 
-def by_pair(population: Population, proposal: Fitted) -> None:
-    moved(population, Pair(proposal, proposal))
+def by_pair(population: Population, proposal: Fittable) -> None:
+    move_and_weight(population, Pair(proposal, proposal))
 
 
-def by_waste_free(population: Population, proposal: Fitted) -> None:
+def by_waste_free(population: Population, proposal: Fittable) -> None:
     waste_free_moves(metropolis_hastings(proposal), 10)(population, POSTERIOR)
 
 
-def by_kernel(population: Population, proposal: Fitted) -> None:
+def by_kernel(population: Population, proposal: Fittable) -> None:
     moved_by(population, metropolis_hastings(proposal), POSTERIOR, 1)
 
 
 @pytest.mark.parametrize("by", [by_pair, by_waste_free, by_kernel])
-def test_nothing_is_learned_from_copies(by: Callable[[Population, Fitted], None]) -> None:
+def test_nothing_is_learned_from_copies(by: Callable[[Population, Fittable], None]) -> None:
     for seed in range(10):
         torch.manual_seed(seed)
         spied = Spied()
@@ -216,7 +216,9 @@ def test_equal_discrete_values_are_no_copies() -> None:
     for _ in range(200):
         population = halved(Population(simulate(coins, (), 40)))
         assert abs(int(population.sides.sum()) - 20) <= 1
-        moved_coins = moved_by(population, metropolis_hastings(Fitted(fit)), POSTERIOR, 1).population["coin"]
+        moved_coins = moved_by(population, metropolis_hastings(Fittable(fit)), POSTERIOR, 1).population[
+            "coin"
+        ]
         changes.append((moved_coins - population["coin"]).double().mean())
     change = torch.stack(changes)
     assert abs(float(change.mean() / (change.std() / math.sqrt(len(change))))) < 3.5

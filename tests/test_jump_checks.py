@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from bcppl.errors import InputError
-from bcppl.inference.filters.smcp3 import Pair, moved
+from bcppl.inference.filters.smcp3 import Pair, move_and_weight
 from bcppl.inference.population import Population
 from bcppl.inference.structures import Jump, Strata, generate_strata, jump, probabilities, resample_strata
 from bcppl.inference.targets import POSTERIOR
@@ -94,7 +94,7 @@ def test_a_check_of_a_pair_sees_a_value_that_is_detached_in_part() -> None:
     torch.manual_seed(0)
     population = Population(generate(program, (), {}, 20)[0])
     back = partial(turned, sign=-1.0, cut=False)
-    whole = moved(population, Pair(partial(turned, sign=1.0, cut=False), back, check=True))
+    whole = move_and_weight(population, Pair(partial(turned, sign=1.0, cut=False), back, check=True))
     torch.testing.assert_close(whole.trace.log_prob(), population.trace.log_prob())
     with pytest.raises(InputError, match=r"Jacobian of a pair .* have to cancel"):
-        moved(population, Pair(partial(turned, sign=1.0, cut=True), back, check=True))
+        move_and_weight(population, Pair(partial(turned, sign=1.0, cut=True), back, check=True))

@@ -20,7 +20,7 @@ from bcppl.distributions.poses import NormalPose
 from bcppl.errors import InputError
 from bcppl.inference.kernels import Kernel, cycle, metropolis_hastings, moved_by, repeat
 from bcppl.inference.population import Population
-from bcppl.inference.proposals import Fitted, drift
+from bcppl.inference.proposals import Fittable, drift
 from bcppl.inference.targets import POSTERIOR, Target
 from bcppl.poses import Freedom
 from bcppl.traces import Trace, generate, simulate
@@ -216,7 +216,7 @@ def test_no_particle_shapes_its_own_proposal(count: int) -> None:
     trace = simulate(program, (), count)
     tags = set(trace["tag"].tolist())
     sweeps = 3
-    done = moved_by(Population(trace), metropolis_hastings(Fitted(spying)), POSTERIOR, sweeps)
+    done = moved_by(Population(trace), metropolis_hastings(Fittable(spying)), POSTERIOR, sweeps)
     assert len(learnt) == len(moved) == 2 * sweeps
     for others, mine in zip(learnt, moved, strict=True):
         assert not others & mine and others | mine == tags

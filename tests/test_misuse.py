@@ -99,7 +99,7 @@ MISUSES: dict[str, tuple[Callable[[], Any], str]] = {
     "waste free": (lambda: waste_free_moves(drift("mu"), 5), WRAP),  # type: ignore[arg-type]
     "a proposal that learns": (
         lambda: markov_chains(metropolis_hastings(learning), start(), 2),
-        r"returns a function .* wrap it in Fitted",
+        r"returns a function .* wrap it in Fittable",
     ),
     "a kernel twice": (
         lambda: markov_chains(metropolis_hastings(metropolis_hastings(nudge)), start(), 2),

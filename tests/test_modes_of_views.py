@@ -265,7 +265,7 @@ def test_the_record_of_a_step_has_the_ancestors_after_a_second_search(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def always(population: Population, proposal: Any) -> second_search.Searched:
-        return second_search.joined_with_draws(population, population.approximation, proposal)
+        return second_search.pooled_with_draws(population, population.approximation, proposal)
 
     monkeypatch.setattr(guided_smc, "searched", always)
     _, before, last = infer(model, world().look(), particles=30, seed=0)

@@ -20,7 +20,7 @@ from bcppl.inference.kernels import metropolis_hastings, moved_by
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import (
     Continuous,
-    Fitted,
+    Fittable,
     Proposal,
     density,
     differences,
@@ -293,7 +293,7 @@ def test_whole_differences_lead_from_mode_to_mode() -> None:
 @pytest.mark.parametrize(
     "make", [lambda a: drift(a), lambda a: independent(a), lambda a: differential_evolution(a)]
 )
-def test_discrete_and_unknown_addresses_are_refused(make: Callable[[str], Fitted]) -> None:
+def test_discrete_and_unknown_addresses_are_refused(make: Callable[[str], Fittable]) -> None:
     population = Population(simulate(choosing, (), 8))
     with pytest.raises(InputError, match=r"'which' is discrete.*prior\('which'\)"):
         make("which").fit(population)

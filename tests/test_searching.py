@@ -20,7 +20,7 @@ from bcppl.distributions.poses import UniformPose
 from bcppl.inference import importance_sampling, infer
 from bcppl.inference.criticism.undetermined import undetermined
 from bcppl.inference.filters import tempered_smc
-from bcppl.inference.filters.searching import EXCESS, excess, joined
+from bcppl.inference.filters.searching import EXCESS, excess, pooled_by_evidence
 from bcppl.inference.filters.smc import Step
 from bcppl.inference.population import Population
 from bcppl.models.point_probe import model as point_probe
@@ -112,7 +112,7 @@ def test_populations_are_joined_by_evidence() -> None:
         return importance_sampling(weighed, (), {"reading": number(0.02)}, 20_000, proposal)
 
     torch.manual_seed(0)
-    both, chosen = joined(half(-1.0), half(1.0))
+    both, chosen = pooled_by_evidence(half(-1.0), half(1.0))
     # Of a normal at 0.02 with deviation 0.02 a share of Phi(1) lies above 0; of an outlier half.
     near, stray = 1.0 - OUTLIER, 2.0 * OUTLIER * float(dist.Normal(0.0, WIDE).log_prob(number(0.02)).exp())
     right = (near * float(dist.Normal(0.0, 1.0).cdf(number(1.0))) + 0.5 * stray) / (near + stray)

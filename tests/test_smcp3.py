@@ -16,7 +16,7 @@ from bcppl import poses
 from bcppl.distributions.poses import NormalPose
 from bcppl.errors import InputError
 from bcppl.inference.filters import smcp3
-from bcppl.inference.filters.smcp3 import Pair, moved
+from bcppl.inference.filters.smcp3 import Pair, move_and_weight
 from bcppl.inference.kernels.jacobian import Charted, Real, Tangent
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import drift
@@ -182,7 +182,7 @@ def worst_z(case: str) -> float:
     program, pair, functions = CASES[case]
     torch.manual_seed(1)
     trace = simulate(program, (), DRAWS)
-    population = moved(Population(trace), pair)
+    population = move_and_weight(Population(trace), pair)
     weights = torch.exp(population.log_weights)[:, None]
     one = torch.ones(DRAWS, 1, dtype=torch.float64)
     before = torch.cat([one, functions(trace)], dim=1)
@@ -251,7 +251,7 @@ def test_pairs_that_are_refused_name_the_address() -> None:
 
     def refused(match: str, forward: Any, backward: Any, check: bool = True) -> None:
         with pytest.raises(InputError, match=match) as caught:
-            moved(population, Pair(forward, backward, check))
+            move_and_weight(population, Pair(forward, backward, check))
         assert "\n" not in str(caught.value)
 
     def shift(trace: Trace) -> Any:
@@ -274,8 +274,8 @@ def test_pairs_that_are_refused_name_the_address() -> None:
         values, choices = shift(trace)
         return {"x": values["x"] + trace["x"].mean(0)}, choices
 
-    moved(population, Pair(shift, unshift, check=True))
-    moved(population, Pair(shift, wrong))
+    move_and_weight(population, Pair(shift, unshift, check=True))
+    move_and_weight(population, Pair(shift, wrong))
     refused(r"backward program does not give 'x' \(old value\) back: particle 0", shift, wrong)
     refused(r"leaves out the forward choice 'step'", shift, elsewhere)
     refused(r"'step'.*for every choice", lambda t: ({"x": shift(t)[0]["x"]}, {}), unshift)

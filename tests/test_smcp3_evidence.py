@@ -17,7 +17,7 @@ from bcppl.inference.filters import smcp3
 from bcppl.inference.filters.smcp3 import Pair
 from bcppl.inference.filters.step import Observed
 from bcppl.inference.population import Population
-from bcppl.inference.proposals import Fitted
+from bcppl.inference.proposals import Fittable
 from bcppl.inference.resampling import adaptive, always, never, systematic
 from bcppl.traces import Series, Trace, generate
 from tests.invariance import number
@@ -163,11 +163,11 @@ def standard_errors(found: Any) -> float:
 
 STEPS: dict[str, tuple[Any, Pair, Callable[[], float]]] = {
     "pulled to what is seen": (static, Pair(pulled, released), static_evidence),
-    "learning": (static, Pair(Fitted(learning), Fitted(learning)), static_evidence),
+    "learning": (static, Pair(Fittable(learning), Fittable(learning)), static_evidence),
     "auxiliary guess": (chain, Pair(guess, unguess), chain_evidence),
     "guided": (chain, Pair(guided, nothing, check=True), chain_evidence),
     "guided series": (WALK, Pair(guided_step, nothing, check=True), chain_evidence),
-    "guided series without history, in halves": (FORGETFUL, Pair(Fitted(towards), nothing), chain_evidence),
+    "guided series without history, in halves": (FORGETFUL, Pair(Fittable(towards), nothing), chain_evidence),
     "drawn from the model": (chain, Pair(nothing, nothing), chain_evidence),
 }
 

@@ -25,7 +25,7 @@ from bcppl.beliefs.weights import (
     normalised,
     weighted_quantiles,
 )
-from bcppl.devices import beside, is_on_host
+from bcppl.devices import is_on_host, on_device_of
 from bcppl.errors import InputError
 from bcppl.poses import FREE, Freedom, as_pose
 
@@ -161,7 +161,7 @@ class Belief:
         """The mean on a GPU: the quaternion is the leading eigenvector of their weighted products."""
         turn = self.world_from_part[:, 3:]
         _, axes = torch.linalg.eigh((turn.T @ (self.weights[:, None] * turn)).cpu())
-        return torch.cat([self.weights @ self.world_from_part[:, :3], beside(axes[:, -1], turn)])
+        return torch.cat([self.weights @ self.world_from_part[:, :3], on_device_of(axes[:, -1], turn)])
 
     @cached_property
     def tangent(self) -> Tensor:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.arrays import Array, ArrayRecord, Indices, Mask
-from bcppl.devices import beside, is_on_host, on_host
+from bcppl.devices import is_on_host, on_device_of, on_host
 from bcppl.effort import Effort
 from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera
@@ -134,7 +134,7 @@ class PartRenderer(ABC):
         pose = poses.as_pose(world_from_part, "world_from_part").reshape(-1, 7)
         with on_host():
             stated = camera.stated_pose()
-        return poses.compose(beside(poses.inverse(stated), pose), pose)
+        return poses.compose(on_device_of(poses.inverse(stated), pose), pose)
 
     @abstractmethod
     def _hits(

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from bcppl import poses, warp_arrays
 from bcppl.arrays import Array
-from bcppl.devices import beside
+from bcppl.devices import on_device_of
 from bcppl.geometry.camera import Camera
 from bcppl.geometry.distortion import Optics
 
@@ -170,8 +170,8 @@ class CastImages:
         """Log-densities (N,) of pixels (1 or N, P), the background (P,) behind them moved by shifts (N,)."""
         total = torch.empty(len(shift), dtype=torch.float64, device=self._device)
         inputs = [
-            (beside(np.ascontiguousarray(depth), shift), wp.float64),
-            (beside(np.ascontiguousarray(behind), shift), wp.float64),
+            (on_device_of(np.ascontiguousarray(depth), shift), wp.float64),
+            (on_device_of(np.ascontiguousarray(behind), shift), wp.float64),
             (shift, wp.float64),
             _law_of(law),
         ]

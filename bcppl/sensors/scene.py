@@ -10,7 +10,7 @@ import pyro
 import torch
 from torch import Tensor
 
-from bcppl.devices import moved
+from bcppl.devices import to_device
 from bcppl.effort import Effort
 from bcppl.errors import InputError
 from bcppl.geometry.simplified import simplified
@@ -145,7 +145,7 @@ class Scene:
 
     def on(self, device: torch.device) -> Self:
         """The same scene with its prior on a device; likelihoods work where the poses are that they get."""
-        prior = moved(self.prior, device)
+        prior = to_device(self.prior, device)
         return self if prior is self.prior else replace(self, prior=prior)
 
     @property

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bcppl.devices import moved, on_device
+from bcppl.devices import on_device, to_device
 from bcppl.distributions.support import freedom_of, refuse_several_poses
 from bcppl.errors import InputError
 from bcppl.traces.carried import Entry
@@ -154,12 +154,12 @@ def constrained(
     return trace, [a for a in ran.distributions if a in given or a in ran.fixed]
 
 
-def at_device(trace: Trace, device: torch.device) -> Trace:
+def trace_to_device(trace: Trace, device: torch.device) -> Trace:
     """The same particles on a device: their values and arguments are moved there, where they are not."""
     if all(value.device == device for value in trace.choices.values()):
         return trace
     with on_device(device):
-        args, choices = moved((trace.args, trace.choices), device)
+        args, choices = to_device((trace.args, trace.choices), device)
         return constrained(trace.program, args, trace.particles, trace.observations, choices)[0]
 
 

@@ -31,7 +31,7 @@ import bcppl
 from bcppl.arrays import Array
 from bcppl.errors import InputError
 from bcppl.inference.filters.smc import Step
-from bcppl.inference.live import Filter, Update
+from bcppl.inference.live import Filter, UpdateInfo
 from bcppl.robot.plan import Plan
 from bcppl.sensors import Recording
 from bcppl.traces import Model
@@ -94,7 +94,7 @@ class BeliefNode(Node):
     def _now(self) -> float:
         return 1e-9 * float(self.get_clock().now().nanoseconds)
 
-    def _updated(self, step: Step, _: Update) -> None:
+    def _updated(self, step: Step, _: UpdateInfo) -> None:
         mean = pose_message(step.belief.mean.numpy())
         pose = PoseWithCovariance(pose=mean, covariance=covariance_of(step.belief))
         self._belief.publish(PoseWithCovarianceStamped(header=header(self._now, self._frame), pose=pose))

@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bcppl.devices import HOST, current_device, moved, on_host
+from bcppl.devices import HOST, current_device, on_host, to_device
 from bcppl.distributions.pose_normals import (
     GaussianMixture,
     PoseFactor,
@@ -39,7 +39,7 @@ from bcppl.inference.approximations.laplace import (
     Normal,
     QuadraticApproximation,
     Search,
-    joined,
+    concatenated_modes,
     quadratic_approximation,
     together,
 )
@@ -96,19 +96,19 @@ class GaussianApproximation:
         device = current_device()
         if device == HOST:
             return self
-        fits = {name: replace(each, fit=moved(each.fit, device)) for name, each in self.fits.items()}
+        fits = {name: replace(each, fit=to_device(each.fit, device)) for name, each in self.fits.items()}
         there = replace(
             self,
-            scene=moved(self.scene, device),
+            scene=to_device(self.scene, device),
             fits=fits,
-            quadratic=moved(self.quadratic, device),
-            adapted=moved(self.adapted, device),
+            quadratic=to_device(self.quadratic, device),
+            adapted=to_device(self.adapted, device),
         )
         there.__dict__.update(
             here=there,
-            prior=moved(self.prior, device),
-            modes=moved(self.modes, device),
-            mixture=moved(self.mixture, device),
+            prior=to_device(self.prior, device),
+            modes=to_device(self.modes, device),
+            mixture=to_device(self.mixture, device),
         )
         return there
 
@@ -117,13 +117,13 @@ class GaussianApproximation:
         self, scene: Any, number: int, action: Any, observations: Mapping[str, Tensor]
     ) -> GaussianApproximation:
         """The same with a measurement that changes little; the quadratic approximation is updated later."""
-        scene = moved(scene, HOST)
+        scene = to_device(scene, HOST)
         sensor = scene.sensor(action)
         if isinstance(sensor, FitsPose):
             name = sensor.viewpoint(action)
             if name in self.fits:
                 return replace(self, scene=scene)
-            near = moved(self.near, HOST)
+            near = to_device(self.near, HOST)
             fits = {**self.fits, name: ViewpointFit(action, sensor.fit(number, action, observations, near))}
             # The estimate moves, so it is asked again which contacts are informative there.
             return replace(self, scene=scene, fits=fits, relevant={})
@@ -144,7 +144,7 @@ class GaussianApproximation:
         for k in own.unique().tolist():
             modes = QuadraticApproximation(*(values[own == k] for values in found.quadratic))
             each.append(adapted(found._sites, _normal(known, k), modes, _within(known, k, wider)))
-        return replace(found, adapted=joined(each))
+        return replace(found, adapted=concatenated_modes(each))
 
     @on_host()
     def searched(self) -> GaussianApproximation:
@@ -274,7 +274,7 @@ class GaussianApproximation:
         """The same with modes that are searched for again: from particles, and from many places."""
         count = len(trace[self.pose])
         some = torch.linspace(0, count - 1, min(count, _FOLLOWED)).long()
-        near = moved(trace[self.pose], HOST)[some]
+        near = to_device(trace[self.pose], HOST)[some]
         return replace(replace(self, near=near, stale=True).updated(), near=None)
 
     def misses_a_mode(self, trace: Any) -> bool:

@@ -130,7 +130,7 @@ def quadratic_approximation(
     if modes is None:
         modes = _quadratic(sites, _searched(sites, prior, before, search or Search()))
     each = [modes, *(_in_hole(sites, one, prior) for one in inside)]
-    return _distinct(joined(each), prior)
+    return _distinct(concatenated_modes(each), prior)
 
 
 def _searched(sites: Sites, prior: Normal, before: GaussianMixture | None, search: Search) -> Tensor:
@@ -191,7 +191,7 @@ def _in_hole(sites: Sites, inside: InHole, prior: Normal) -> QuadraticApproximat
 
 def together(each: Sequence[QuadraticApproximation], prior: GaussianMixture) -> QuadraticApproximation:
     """The modes reached from each of a prior's components, without those that hardly weigh beside others."""
-    modes = joined(each)
+    modes = concatenated_modes(each)
     own = torch.arange(len(each)).repeat_interleave(torch.tensor([len(one.around) for one in each]))
     weight = modes.posterior_each(prior.centers[own], torch.linalg.inv(prior.covariances[own])).log_weights
     weight = weight + prior.log_weights[own]
@@ -200,7 +200,7 @@ def together(each: Sequence[QuadraticApproximation], prior: GaussianMixture) -> 
     return QuadraticApproximation(*(values[kept] for values in modes))
 
 
-def joined(each: Sequence[QuadraticApproximation]) -> QuadraticApproximation:
+def concatenated_modes(each: Sequence[QuadraticApproximation]) -> QuadraticApproximation:
     """The modes of all."""
     return QuadraticApproximation(*(torch.cat(values) for values in zip(*each, strict=True)))
 

@@ -40,7 +40,7 @@ from bcppl.inference.population import Population
 from bcppl.inference.resampling import seeded, systematic
 from bcppl.traces import Trace
 from bcppl.traces.series import SeriesTrace
-from bcppl.traces.verbs import at_device
+from bcppl.traces.verbs import trace_to_device
 
 PARTICLES = 4
 REPLICAS = 10  # images for each particle
@@ -93,7 +93,7 @@ def surprise(
     with seeded(seed), torch.no_grad():
         chosen = systematic(population.log_weights, particles)
         # They are few: on the host, wherever the particles are.
-        few = at_device(trace.chosen(chosen), HOST)
+        few = trace_to_device(trace.chosen(chosen), HOST)
         copies: list[Trace] = []
 
         def replicated(address: str) -> Any:

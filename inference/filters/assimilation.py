@@ -10,7 +10,7 @@ from torch import Tensor
 from bcppl.errors import NoWeightError
 from bcppl.inference.approximations.approximation import Approximation
 from bcppl.inference.filters.screening import by_mode, screened
-from bcppl.inference.filters.smcp3 import Pair, moved as moved_by_pair
+from bcppl.inference.filters.smcp3 import Pair, move_and_weight
 from bcppl.inference.filters.step import Observed
 from bcppl.inference.population import Population
 from bcppl.inference.sizing import replicate
@@ -41,7 +41,7 @@ def assimilate(population: Population, observed: Observed, pair: Pair, least: in
 
     def weighted(population: Population) -> Population | None:
         try:
-            return moved_by_pair(population, pair, observed)
+            return move_and_weight(population, pair, observed)
         except NoWeightError:
             return None
 

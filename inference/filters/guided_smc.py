@@ -26,7 +26,7 @@ import torch
 from torch import Tensor
 
 from bcppl.arguments import number_within, whole_number
-from bcppl.devices import HOST, moved, same_random_state
+from bcppl.devices import HOST, same_random_state, to_device
 from bcppl.inference.approximations.approximation import Approximation
 from bcppl.inference.approximations.gaussian import GaussianApproximation
 from bcppl.inference.filters.assimilation import Assimilated, assimilate, assimilate_screened
@@ -90,7 +90,7 @@ def kernel(pose: str, proposals: Callable[[Any], Sequence[Program]], *, screen: 
     once about where they have led.
     """
 
-    def moved(population: Population) -> Move:
+    def move_of(population: Population) -> Move:
         others = [address for address in continuous_addresses(population.trace) if address != pose]
         walks = [metropolis_hastings(drift(other, WALK)) for other in others]
         of_pose: list[Any] = [*proposals(population.approximation)] or [drift(pose, WALK)]
@@ -100,7 +100,7 @@ def kernel(pose: str, proposals: Callable[[Any], Sequence[Program]], *, screen: 
             guided = [surrogate_transition(cycle(guided), approximated)]
         return sequence([*_one_of(walks), *guided])(population)
 
-    return moved
+    return move_of
 
 
 def _one_of(kernels: Sequence[Kernel]) -> list[Kernel]:
@@ -280,7 +280,7 @@ def infer(
     )
 
     def gaussian(scene: Any) -> GaussianApproximation:
-        return GaussianApproximation(model.pose, moved(scene, HOST))
+        return GaussianApproximation(model.pose, to_device(scene, HOST))
 
     moves = kernel(model.pose, gaussian_proposals, screen=screen)
 

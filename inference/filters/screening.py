@@ -17,7 +17,7 @@ from typing import Any
 from torch import Tensor
 
 from bcppl.errors import NoWeightError
-from bcppl.inference.filters.smcp3 import Pair, moved
+from bcppl.inference.filters.smcp3 import Pair, move_and_weight
 from bcppl.inference.filters.step import Observed
 from bcppl.inference.population import Population
 from bcppl.inference.resampling import systematic
@@ -61,7 +61,7 @@ def screened(
 
     many = replicate(population, COPIES)
     try:
-        by_cheap = moved(many, pair, observed, ratio)
+        by_cheap = move_and_weight(many, pair, observed, ratio)
         chosen = by_mode(by_cheap, len(population))
         few, old = by_cheap.selected(chosen), many.trace[chosen]
         drawn = frozenset(address for address in few.trace.choices if address not in old.choices)

@@ -78,7 +78,7 @@ class Searching:
                 return done
             every = Observed(observed.args, done.population.trace.observations)
             ends, fresh = self._search(every, len(population))
-        both, chosen = joined(done.population, fresh)
+        both, chosen = pooled_by_evidence(done.population, fresh)
         moved = moved_by(both, self.kernel(ends), POSTERIOR, self.sweeps)
         return Stepped(moved.population, _record(done, population, moved, chosen))
 
@@ -133,7 +133,7 @@ def _record(done: Stepped, before: Population, moved: Moved, chosen: Tensor) -> 
     )
 
 
-def joined(old: Population, fresh: Population) -> tuple[Population, Tensor]:
+def pooled_by_evidence(old: Population, fresh: Population) -> tuple[Population, Tensor]:
     """As many particles as `old` has, drawn from two populations of one posterior by weight and evidence.
 
     Each counts as its estimate of the evidence, as islands do (Verge, Dubarry, Del Moral and Moulines,

@@ -3,8 +3,8 @@
 Where half of the particles explain the measurements far worse than a pose which the approximation has
 reached, they miss the posterior's mass: a contact is an outlier to all of them alike, and their weights do
 not show it. Others are then drawn by importance sampling from the approximation, given all measurements, and
-joined with them (`bcppl.inference.filters.searching.joined`). Since the second population is drawn only where
-it is needed, the evidence is consistent rather than unbiased.
+pooled with them (`bcppl.inference.filters.searching.pooled_by_evidence`). Since the second population is
+drawn only where it is needed, the evidence is consistent rather than unbiased.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from torch import Tensor
 
 from bcppl.errors import NoWeightError
 from bcppl.inference.filters.screening import screened_draws
-from bcppl.inference.filters.searching import joined
+from bcppl.inference.filters.searching import pooled_by_evidence
 from bcppl.inference.importance import importance_sampling
 from bcppl.inference.population import Population
 from bcppl.inference.targets import runs_physics
@@ -26,7 +26,7 @@ COPIES = 20  # draws for each particle: the approximation leaves some per cent o
 
 
 class Searched(NamedTuple):
-    """The population after a search, and which particles (N,) of `joined` it has; None for those before."""
+    """The population after a search, and which of the pooled particles (N,) it has; None for those before."""
 
     population: Population
     chosen: Tensor | None = None
@@ -51,7 +51,7 @@ def searched(population: Population, proposal: Callable[[Any], Callable[..., Any
     approximation, trace = population.approximation, population.trace
     if approximation.shortfall(trace) < MISSED and not approximation.misses_a_mode(trace):
         return Searched(population)
-    other, chosen = joined_with_draws(population, approximation, proposal)
+    other, chosen = pooled_with_draws(population, approximation, proposal)
     return Searched(_followed(other), chosen)
 
 
@@ -63,7 +63,7 @@ def _followed(population: Population) -> Population:
     return population.with_approximation(approximation.following(trace))
 
 
-def joined_with_draws(
+def pooled_with_draws(
     population: Population, approximation: Any, proposal: Callable[[Any], Callable[..., Any]]
 ) -> Searched:
     """The population, joined with one drawn from an approximation by their evidence.
@@ -81,7 +81,7 @@ def joined_with_draws(
             drawn = importance_sampling(
                 trace.program, trace.args, trace.observations, count, proposal(approximation)
             )
-        both, chosen = joined(population, drawn)
+        both, chosen = pooled_by_evidence(population, drawn)
     except NoWeightError:
         return Searched(population)
     if bool((chosen >= len(population)).any()):

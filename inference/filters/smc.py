@@ -22,11 +22,11 @@ from bcppl.beliefs import Belief
 from bcppl.devices import (
     HOST,
     device_named,
-    moved,
     on_device,
     random_state,
     seeded_state,
     set_random_state,
+    to_device,
 )
 from bcppl.errors import InferenceError, InputError
 from bcppl.inference.filters.step import Observed, StepFunction, StepInfo, refuse_no_step
@@ -202,7 +202,7 @@ def _steps(
     if scene is None:
         _warn_of_problems(recording)
         scene = model.prepare(recording)
-    scene = moved(scene, device)
+    scene = to_device(scene, device)
     measurements = recording.measurements
     if start is None:
         state = [seeded_state(seed, device)]
@@ -214,7 +214,7 @@ def _steps(
                 f"it samples {', '.join(population.trace.choices) or 'nothing'} before any measurement."
             )
         start = _prior(model, population, state[0])
-        truth = _Truth(model, moved(scene, HOST), recording, population, seed)
+        truth = _Truth(model, to_device(scene, HOST), recording, population, seed)
         yield start
     else:
         if start.taken > len(measurements):
@@ -231,7 +231,7 @@ def _steps(
             start.population.on(device),
             len(start.population),
         )
-        truth = _Truth(model, moved(scene, HOST), recording, population, seed)
+        truth = _Truth(model, to_device(scene, HOST), recording, population, seed)
         for observed in observations_of(model, scene, measurements[: start.taken]):
             truth.assimilate(observed)
     for count, observed in enumerate(
@@ -255,7 +255,7 @@ def _steps(
         truth.assimilate(observed)
         gap = truth.gap(population)
         evidence, distinct = population.log_evidence, belief.distinct
-        record = moved(happened, HOST)
+        record = to_device(happened, HOST)
         info = Info(label, _time(measurement), evidence, distinct, gap, elapsed, spent, record)
         start = Step(belief, info, population, state[0], count)
         yield start
@@ -299,7 +299,7 @@ class _Truth:
         """Extend its trace."""
         if self.trace is not None:
             with own_state(self.state, 1):
-                self.trace, _ = extend(self.trace, *moved(observed, HOST))
+                self.trace, _ = extend(self.trace, *to_device(observed, HOST))
             if set(self.trace.choices) != self.latent:
                 self.trace = None
 

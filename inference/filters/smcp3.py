@@ -42,7 +42,7 @@ from bcppl.inference.kernels.jacobian import (
 )
 from bcppl.inference.kernels.kernel import scattered, weighted
 from bcppl.inference.population import Population
-from bcppl.inference.proposals import Fitted, Proposal, program_of
+from bcppl.inference.proposals import Fittable, Proposal, program_of
 from bcppl.inference.resampling import Resample, adaptive, check_resample
 from bcppl.traces import Program, Trace, Update, extend, simulate, update
 from bcppl.traces.anticipated import Anticipated
@@ -56,7 +56,7 @@ OLD, FORWARD, NEW, BACKWARD = "old value", "forward choice", "new value", "backw
 
 @dataclass(frozen=True)
 class Pair:
-    """A forward and a backward program, each `program(trace)` or one that learns (`Fitted`).
+    """A forward and a backward program, each `program(trace)` or one that learns (`Fittable`).
 
     The forward program returns (new values of latent addresses, choices of the backward program); the
     backward program (old values, choices of the forward program), so that one undoes the other. Latent
@@ -82,7 +82,7 @@ class Pair:
     check: bool = False
 
 
-def moved(
+def move_and_weight(
     population: Population,
     pair: Pair,
     observed: Observed | None = None,
@@ -105,7 +105,7 @@ def moved(
         InferenceError: no particle has any weight left.
     """
     count = len(population)
-    if not isinstance(pair.forward, Fitted) and not isinstance(pair.backward, Fitted):
+    if not isinstance(pair.forward, Fittable) and not isinstance(pair.backward, Fittable):
         parts = [torch.arange(count)]
     else:
         population = halved(population)
@@ -136,13 +136,13 @@ def smcp3(pair: Pair, *, resample: Resample | None = None) -> StepFunction:
         resample: when and how; by default systematic below half the effective sample size.
 
     Returns:
-        The step. It raises what `moved` raises.
+        The step. It raises what `move_and_weight` raises.
     """
     resample = adaptive() if resample is None else resample
     check_resample("smcp3", resample)
 
     def step(population: Population, observed: Observed) -> Stepped:
-        updated = moved(population, pair, observed)
+        updated = move_and_weight(population, pair, observed)
         resampled, ancestors = resample(updated)
         info = StepInfo(
             resampled=int(ancestors is not None),

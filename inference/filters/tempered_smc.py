@@ -67,7 +67,7 @@ def kernel(
     far = [] if modes is None else [metropolis_hastings(jumps(pose, modes, along, conditional))]
     alone = mixture([metropolis_hastings(drift(pose, (0.2, 2.0))), metropolis_hastings(redrawn), *far])
 
-    def moved(population: Population) -> Move:
+    def move_of(population: Population) -> Move:
         others = [address for address in continuous_addresses(population.trace) if address != pose]
         if not others:
             return alone(population)
@@ -79,7 +79,7 @@ def kernel(
         return {a: spread_of(a)(population) for a in continuous_addresses(population.trace)}
 
     given = [metropolis_hastings(p, *([spreads] if takes(p, 2) else [])) for p in proposals]
-    shaped = sequence([moved, *given]) if given else moved
+    shaped = sequence([move_of, *given]) if given else move_of
 
     def with_choices(population: Population) -> Move:
         sites = population.trace.distributions

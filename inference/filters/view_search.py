@@ -24,7 +24,7 @@ from bcppl.distributions.depth import DepthDistribution
 from bcppl.distributions.support import freedom_of
 from bcppl.errors import NoWeightError
 from bcppl.inference.criticism.predictive import surprise
-from bcppl.inference.filters.second_search import Searched, joined_with_draws
+from bcppl.inference.filters.second_search import Searched, pooled_with_draws
 from bcppl.inference.population import Population
 from bcppl.inference.proposals.climbing import modes
 from bcppl.traces import Trace, generate
@@ -70,4 +70,4 @@ def searched_by_climbing(
         ends = modes(climbers, pose, along)
     except NoWeightError:
         return Searched(population)
-    return joined_with_draws(population, approximated(trace, ends.centers), proposal)
+    return pooled_with_draws(population, approximated(trace, ends.centers), proposal)

@@ -25,7 +25,7 @@ from bcppl.inference.kernels.hamiltonian import hmc
 from bcppl.inference.kernels.hastings import metropolis_hastings
 from bcppl.inference.kernels.involutions import involutive
 from bcppl.inference.kernels.kernel import Kernel, Move, fitted, scattered
-from bcppl.inference.kernels.rejuvenation import Until, displacement, distinct, moved_by, until
+from bcppl.inference.kernels.rejuvenation import Until, displacement, moved_by, until
 from bcppl.inference.kernels.staged import (
     Surrogate,
     delayed_acceptance,
@@ -41,7 +41,6 @@ __all__ = [
     "cycle",
     "delayed_acceptance",
     "displacement",
-    "distinct",
     "fitted",
     "halved",
     "halves",

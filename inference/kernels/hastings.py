@@ -46,7 +46,7 @@ def metropolis_hastings(proposal: Proposal, *learned: Callable[[Population], Any
                 if callable(forward.result):
                     raise InputError(
                         "a proposal returns a function and samples nothing; if it learns from a population, "
-                        "wrap it in Fitted(...), and if it is a kernel, use it as it is."
+                        "wrap it in Fittable(...), and if it is a kernel, use it as it is."
                     )
                 chosen = ", ".join(forward.choices) or "nothing"
                 raise InputError(

@@ -38,7 +38,7 @@ def involutive(program: Proposal, involution: Involution, *, check: bool = False
     (`bcppl.inference.kernels.jacobian`).
 
     Args:
-        program: a Pyro program `program(trace)`, or one that learns (`Fitted`), that samples the auxiliary
+        program: a Pyro program `program(trace)`, or one that learns (`Fittable`), that samples the auxiliary
             choices.
         involution: `involution(values, choices) -> (new values, new choices)`, mappings from latent addresses
             and from the program's addresses to tensors (N, *event), each particle's from its own. What it

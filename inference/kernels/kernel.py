@@ -18,7 +18,7 @@ from torch import Tensor
 
 from bcppl.errors import InputError
 from bcppl.inference.population import Population
-from bcppl.inference.proposals.proposal import Fitted
+from bcppl.inference.proposals.proposal import Fittable
 from bcppl.inference.targets import Target, accept
 from bcppl.traces import Trace
 
@@ -56,7 +56,7 @@ WRAP = "wrap a proposal in metropolis_hastings(...)"
 
 def refuse_other(where: str, kernel: Any) -> None:
     """Refuse what cannot be a kernel."""
-    if isinstance(kernel, Fitted):
+    if isinstance(kernel, Fittable):
         given = "a proposal"
     elif not callable(kernel):
         given = f"a {type(kernel).__name__}"

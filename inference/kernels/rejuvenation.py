@@ -13,7 +13,7 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.arguments import number_within, whole_number
 from bcppl.beliefs import normalised
-from bcppl.devices import beside
+from bcppl.devices import on_device_of
 from bcppl.distributions.support import freedom_of
 from bcppl.errors import InputError
 from bcppl.inference.kernels.halving import halved, halves
@@ -48,7 +48,7 @@ class Until:
 
     def reached(self, start: Population, now: Population) -> bool:
         """Whether the criteria hold for a population that began at `start`."""
-        if self.distinct is not None and distinct(now) < min(self.distinct, len(now)):
+        if self.distinct is not None and now.distinct < min(self.distinct, len(now)):
             return False
         return self.displacement is None or bool((self.displaced(start, now) >= self.displacement).all())
 
@@ -95,11 +95,6 @@ def until(
     return Until(distinct, displacement, whole_number("until may make {} sweeps at most", most), tuple(of))
 
 
-def distinct(population: Population) -> int:
-    """How many particles with weight differ in some latent value."""
-    return population.distinct
-
-
 def displacement(start: Population, now: Population, of: Collection[str] = ()) -> Tensor:
     """Weighted mean squared displacement (K,) on each axis, as a share of the axis's variance now.
 
@@ -127,7 +122,7 @@ def _coordinates(start: Population, now: Population, address: str) -> tuple[Tens
     if freedom is None or old.ndim != 2:
         old, new = (v.reshape(len(now), -1).to(torch.float64) for v in (old, new))
         return new - old, new
-    mean = beside(now.belief(address).mean, new)
+    mean = on_device_of(now.belief(address).mean, new)
     before, after = (freedom.coordinates(poses.local(mean, pose)) for pose in (old, new))
     return after - before, after
 

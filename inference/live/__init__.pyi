@@ -1,4 +1,4 @@
 from bcppl.inference.live.client import Client as Client
-from bcppl.inference.live.filter import Filter as Filter, Update as Update
+from bcppl.inference.live.filter import Filter as Filter, UpdateInfo as UpdateInfo
 from bcppl.inference.live.playing import play as play
 from bcppl.inference.live.sampler import Sampler as Sampler

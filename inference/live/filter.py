@@ -48,7 +48,7 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False)
-class Update:
+class UpdateInfo:
     """What one update of a live belief did.
 
     Attributes:
@@ -97,7 +97,7 @@ class Filter:
         seed: int = 0,
         deadline: float = 0.5,
         on_fault: Literal["skip", "stop"] = "skip",
-        on_update: Callable[[Step, Update], None] | None = None,
+        on_update: Callable[[Step, UpdateInfo], None] | None = None,
     ) -> None:
         self.particles = whole_number("a live filter is to run {} particles", particles)
         self.deadline = number_within("a live filter has a deadline of {} s", deadline, above=0.0)
@@ -109,7 +109,7 @@ class Filter:
         self._recording = replace(recording, measurements=[])
         self._waiting = Waiting()
         self._changed = threading.Condition()
-        self._updates: deque[Update] = deque(maxlen=KEPT)
+        self._updates: deque[UpdateInfo] = deque(maxlen=KEPT)
         self._pages: list[LivePage] = []
         self._shared: dict[str, dict[str, Any]] = {}  # by kind and name, such as cameras
         self._failed: BaseException | None = None
@@ -159,7 +159,7 @@ class Filter:
         return self._recording
 
     @property
-    def updates(self) -> Sequence[Update]:
+    def updates(self) -> Sequence[UpdateInfo]:
         """The newest thousand updates."""
         with self._changed:
             return list(self._updates)
@@ -314,7 +314,7 @@ class Filter:
                 self._failed = error
             else:
                 warnings.warn(f"{fault.rstrip('.')}: it is left out.", RuntimeWarning, stacklevel=1)
-        update = Update(joined, count, time.monotonic() - arrived, fault)
+        update = UpdateInfo(joined, count, time.monotonic() - arrived, fault)
         with self._changed:
             self._updates.append(update)
         for page in self._pages if not fault else []:

@@ -9,12 +9,12 @@ from bcppl.sensors import Recording
 from bcppl.viewer.live import LivePage
 
 if TYPE_CHECKING:
-    from bcppl.inference.live.filter import Update
+    from bcppl.inference.live.filter import UpdateInfo
 
 COLUMNS = ("measurement", "particles", "joined", "late s", "log Z")
 
 
-def show(page: LivePage, step: Step, recording: Recording, update: Update | None = None) -> None:
+def show(page: LivePage, step: Step, recording: Recording, update: UpdateInfo | None = None) -> None:
     """Add the newest step, and what its update did."""
     late = ["", ""] if update is None else [str(update.joined), f"{update.seconds:.2f}"]
     cells = [step.info.label, str(len(step.population)), *late, f"{step.info.log_evidence:.2f}"]

@@ -25,7 +25,7 @@ from bcppl.inference.proposals.density import independent as independent
 from bcppl.inference.proposals.depth_points import depth_alignment as depth_alignment
 from bcppl.inference.proposals.differences import differential_evolution as differential_evolution
 from bcppl.inference.proposals.proposal import (
-    Fitted as Fitted,
+    Fittable as Fittable,
     Proposal as Proposal,
     program_of as program_of,
 )

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from bcppl import poses
-from bcppl.devices import beside
+from bcppl.devices import on_device_of
 from bcppl.distributions.pose_normals import GaussianMixture, transport, widened_mixture
 from bcppl.distributions.poses import MixturePose, NormalPose, NormalTwist
 from bcppl.inference.approximations.gaussian import GaussianApproximation
@@ -102,7 +102,7 @@ def joint_random_walk(given: GaussianApproximation) -> Program:
 
     def program(trace: Trace) -> None:
         approximation = given.here
-        size = torch.exp(pyro.sample("walk", dist.Uniform(*beside(SCALES, trace[approximation.pose]))))
+        size = torch.exp(pyro.sample("walk", dist.Uniform(*on_device_of(SCALES, trace[approximation.pose]))))
         pose, mixture = trace[approximation.pose], approximation.mixture
         covariance = mixture.covariances[mixture.component(pose)]
         step = (2.38 * size) ** 2 / 6.0

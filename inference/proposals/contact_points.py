@@ -23,14 +23,14 @@ from bcppl.inference.proposals.least_squares import (
     check_pose,
     matching,
 )
-from bcppl.inference.proposals.proposal import Fitted
+from bcppl.inference.proposals.proposal import Fittable
 from bcppl.poses import Freedom
 from bcppl.traces import Trace
 
 SITES = ("contacts_*", "peg_*", "onset_*")
 
 
-def contact_alignment(address: str, sites: Sequence[str] = SITES, *, reach: float = 1.0) -> Fitted:
+def contact_alignment(address: str, sites: Sequence[str] = SITES, *, reach: float = 1.0) -> Fittable:
     """A proposal about the pose at which simulated contacts meet the measured ones.
 
     The part is moved along its contact normals: by the distance of a measured contact from the simulated one

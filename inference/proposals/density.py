@@ -12,7 +12,7 @@ from torch import Tensor
 from bcppl.arguments import number_within, whole_number
 from bcppl.inference.population import Population
 from bcppl.inference.proposals.coordinates import Coordinates
-from bcppl.inference.proposals.proposal import Fitted
+from bcppl.inference.proposals.proposal import Fittable
 from bcppl.inference.proposals.spread import (
     Places,
     conditioned,
@@ -33,7 +33,7 @@ def independent(
     *,
     inflation: float = 1.05,
     wide: tuple[float, float] = (0.05, 2.0),
-) -> Fitted:
+) -> Fittable:
     """A proposal from a mixture of normals fitted to the particles, independent of the particle's value.
 
     The independence sampler of Tierney (Annals of Statistics 22, 1994, section 2.3.3). One more component is
@@ -87,7 +87,7 @@ def independent(
 
         return independently
 
-    return Fitted(fit)
+    return Fittable(fit)
 
 
 class Mixture(NamedTuple):

@@ -26,7 +26,7 @@ from bcppl.inference.proposals.least_squares import (
     check_pose,
     matching,
 )
-from bcppl.inference.proposals.proposal import Fitted
+from bcppl.inference.proposals.proposal import Fittable
 from bcppl.poses import FREE, Freedom
 from bcppl.rendering.part_renderer import Hits
 from bcppl.traces import Trace
@@ -36,7 +36,7 @@ ENOUGH = 200  # pixels of an image, for each particle: more hardly change the st
 GRAZING = 0.3  # the cosine of incidence below which the weight of a surface's depth grows no further
 
 
-def depth_alignment(address: str, sites: str = "depth_*", *, steps: int = 1, reach: float = 1.0) -> Fitted:
+def depth_alignment(address: str, sites: str = "depth_*", *, steps: int = 1, reach: float = 1.0) -> Fittable:
     """A proposal about the pose at which the part's rendered points meet the measured depth.
 
     Gauss-Newton on point to plane distances along the pixels' rays, the planes those of the faces that are

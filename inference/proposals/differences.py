@@ -13,7 +13,7 @@ from torch import Tensor
 from bcppl.arguments import number_within
 from bcppl.inference.population import Population
 from bcppl.inference.proposals.coordinates import Coordinates
-from bcppl.inference.proposals.proposal import Fitted
+from bcppl.inference.proposals.proposal import Fittable
 from bcppl.inference.proposals.spread import spread_of, weighted_places
 from bcppl.traces import Trace
 
@@ -22,7 +22,7 @@ DIFFERENCES = 200  # drawn when it is fitted
 
 def differential_evolution(
     address: str, *, scale: float | None = None, jumps: float = 0.1, noise: float = 0.05
-) -> Fitted:
+) -> Fittable:
     """A proposal that steps along plus or minus the difference of two other particles, with noise.
 
     ter Braak, A Markov Chain Monte Carlo version of the genetic algorithm Differential Evolution, Statistics
@@ -67,7 +67,7 @@ def differential_evolution(
 
         return along
 
-    return Fitted(fit)
+    return Fittable(fit)
 
 
 def _differences(coordinates: Coordinates, places: Tensor, weights: Tensor) -> Tensor:

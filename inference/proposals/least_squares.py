@@ -21,7 +21,7 @@ from bcppl.distributions.poses import MixturePose
 from bcppl.distributions.support import freedom_of
 from bcppl.errors import InputError
 from bcppl.inference.population import Population
-from bcppl.inference.proposals.proposal import Fitted
+from bcppl.inference.proposals.proposal import Fittable
 from bcppl.inference.proposals.spread import spread_of
 from bcppl.poses import FREE, Freedom
 from bcppl.traces import Trace
@@ -90,7 +90,7 @@ class Alignment:
 
 def alignment_proposal(
     address: str, reach: float, align: Callable[[Trace, Tensor, Freedom], Alignment]
-) -> Fitted:
+) -> Fittable:
     """A proposal about the alignment of each particle.
 
     `align(trace, damping (d, d), free axes)` gives it, damped by a normal prior at the old pose, with the
@@ -106,7 +106,7 @@ def alignment_proposal(
 
         return towards_alignment
 
-    return Fitted(fit)
+    return Fittable(fit)
 
 
 def matching(trace: Trace, name: str, patterns: Sequence[str]) -> list[str]:

@@ -3,7 +3,7 @@
 Each particle's new value depends on its own old values only. What a proposal learns from a population is
 fixed before it runs, the same for the forward and the backward density, and comes from other particles than
 those that it moves (`bcppl.inference.kernels.moved_by`). So a program must not read `trace["mu"].mean()`:
-that is for `Fitted`, or for the functions `learned` of `metropolis_hastings(proposal, *learned)`.
+that is for `Fittable`, or for the functions `learned` of `metropolis_hastings(proposal, *learned)`.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from bcppl.traces import Program
 
 
 @dataclass(frozen=True)
-class Fitted:
+class Fittable:
     """A proposal that learns from a population before it runs: `fit(population) -> program(trace)`."""
 
     fit: Callable[[Population], Program]
 
 
-Proposal = Program | Fitted
+Proposal = Program | Fittable
 
 
 def program_of(
@@ -35,11 +35,11 @@ def program_of(
     Raises:
         InputError: what is given is neither a program nor one that learns.
     """
-    if not isinstance(proposal, Fitted) and not callable(proposal):
+    if not isinstance(proposal, Fittable) and not callable(proposal):
         raise InputError(
             f"{proposal!r} is given in place of a proposal; give a program, or a shipped one such as "
             "drift('x') from bcppl.inference.proposals."
         )
-    program = proposal.fit(population) if isinstance(proposal, Fitted) else proposal
+    program = proposal.fit(population) if isinstance(proposal, Fittable) else proposal
     values = [learn(population) for learn in learned]
     return (lambda trace: program(trace, *values)) if values else program

@@ -15,13 +15,13 @@ from bcppl.arguments import number_within
 from bcppl.errors import InputError
 from bcppl.inference.population import Population
 from bcppl.inference.proposals.coordinates import Coordinates, coordinates_of
-from bcppl.inference.proposals.proposal import Fitted
+from bcppl.inference.proposals.proposal import Fittable
 from bcppl.inference.proposals.spread import conditioned, spread_of, weighted_places
 from bcppl.inference.summaries import weighted_covariance
 from bcppl.traces import Trace
 
 
-def drift(address: str, scales: tuple[float, float] = (0.05, 1.0)) -> Fitted:
+def drift(address: str, scales: tuple[float, float] = (0.05, 1.0)) -> Fittable:
     """A random walk with the weighted covariance of the particles and a random scale.
 
     Poses are moved in their tangent space along the free axes, other values as vectors in unbounded
@@ -52,10 +52,10 @@ def drift(address: str, scales: tuple[float, float] = (0.05, 1.0)) -> Fitted:
 
         return random_walk
 
-    return Fitted(fit)
+    return Fittable(fit)
 
 
-def joint_drift(*addresses: str, scales: tuple[float, float] = (0.05, 1.0)) -> Fitted:
+def joint_drift(*addresses: str, scales: tuple[float, float] = (0.05, 1.0)) -> Fittable:
     """A random walk over several latent values with their joint covariance.
 
     Where measurements inform a difference (the pose of a part in the frame of a camera whose own pose is
@@ -93,7 +93,7 @@ def joint_drift(*addresses: str, scales: tuple[float, float] = (0.05, 1.0)) -> F
 
         return random_walk
 
-    return Fitted(fit)
+    return Fittable(fit)
 
 
 class _Link(NamedTuple):

@@ -50,7 +50,10 @@ class Strata:
         for structure, each in populations:
             if len(each):
                 parts.setdefault(structure, []).append(each)
-        whole = {each: joined(parts[each]) for each in sorted(parts, key=lambda s: tuple(s.items()))}
+        whole = {
+            each: concatenated_population(parts[each])
+            for each in sorted(parts, key=lambda s: tuple(s.items()))
+        }
         log_total = _log_total(whole.values())
         return cls(
             {
@@ -212,7 +215,7 @@ def mean(strata: Strata, address: str) -> Tensor:
     return torch.einsum("n,n...->...", weights, strata[address].to(torch.float64))
 
 
-def joined(populations: Iterable[Population]) -> Population:
+def concatenated_population(populations: Iterable[Population]) -> Population:
     """One population of the particles of several of one structure, in their order, with their weights.
 
     A particle stays in its half (`bcppl.inference.kernels.halving`), so that it is in that of its copies. The

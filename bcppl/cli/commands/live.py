@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from bcppl.inference.filters.smc import Step
-    from bcppl.inference.live import Update
+    from bcppl.inference.live import UpdateInfo
     from bcppl.inference.live.server import Server
     from bcppl.recordings import Recording
     from bcppl.traces import Model
@@ -91,7 +91,7 @@ def live(
     report = Report(console, measured, chosen)
     empty = replace(measured, measurements=[])
 
-    def shown(step: Step, update: Update) -> None:
+    def shown(step: Step, update: UpdateInfo) -> None:
         report.row(step)
 
     settings: dict[str, Any] = {"particles": particles, "seed": seed, "deadline": deadline}
@@ -131,7 +131,7 @@ def _asked(page: LivePage, console: Console) -> bool:
     return webbrowser.open(page.url)
 
 
-def lateness(updates: Sequence[Update], deadline: float) -> str:
+def lateness(updates: Sequence[UpdateInfo], deadline: float) -> str:
     """How late updates were, in a sentence."""
     late = sorted(update.seconds for update in updates)
     if not late:

@@ -18,7 +18,7 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.arguments import number_within
 from bcppl.arrays import Array
-from bcppl.devices import beside, is_on_host, numbers
+from bcppl.devices import is_on_host, numbers, on_device_of
 from bcppl.distributions.checks import Check
 from bcppl.distributions.depth.camera_image import CameraImage
 from bcppl.distributions.depth.observed import CACHE, Observed
@@ -188,21 +188,21 @@ class DepthDistribution(CameraImage):
         given = isinstance(self.bias, Tensor) or self.bias != 0.0
         bias = torch.as_tensor(self.bias, dtype=torch.float64, device=pose.device).detach().expand(len(pose))
         moves = given and not self.background_is_measured
-        total = beside(seen.total_without_part, pose)
+        total = on_device_of(seen.total_without_part, pose)
         if moves:
             nothing, known = seen.apart(self._law)
-            total = beside(nothing, pose)
+            total = on_device_of(nothing, pose)
             if known.any():
                 shown = caster.totals(seen.depth[:, known], seen.behind[known], bias, self._law)
                 total = total + shown
         pixels = Pixels(seen.depth, seen.valid, seen.behind, seen.without_part, np.empty(0), moves)
         gains = caster.gains(self.camera, pose, pixels, self._law, bias)
-        return beside(seen.power, pose) * (total + gains)
+        return on_device_of(seen.power, pose) * (total + gains)
 
     def without_part(self, value: Tensor) -> Tensor:
         """Log-probability (1 or N,) of an image (H, W), or of N, with no part in view, and no bias."""
         seen = self.observed(value)
-        return beside(seen.power * seen.total_without_part, self.pose)
+        return on_device_of(seen.power * seen.total_without_part, self.pose)
 
     def _sample(self) -> Tensor:
         images = torch.from_numpy(self.renderer.images(self.camera, self.apparent_pose))

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.special import log_ndtr
 
 from bcppl import poses
-from bcppl.devices import beside
+from bcppl.devices import on_device_of
 from bcppl.distributions.episodes.rows import TURN
 from bcppl.distributions.manifold import Gaps
 
@@ -54,7 +54,7 @@ def log_blocked(measure: MeasuresWitness, pose: Tensor, rows: Tensor, spread: Te
     Returns:
         (N,) the sum over rows.
     """
-    rows = beside(rows, pose)
+    rows = on_device_of(rows, pose)
     peg = rows[:, :7]
     gaps = measure(pose, peg)
     about = poses.transform(pose, gaps.witness)

@@ -11,7 +11,7 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.arrays import Array
 from bcppl.compiled import compiled
-from bcppl.devices import beside, moved, numbers
+from bcppl.devices import numbers, on_device_of, to_device
 from bcppl.distributions.episodes.linear_errors import Effect, LinearErrors
 from bcppl.distributions.episodes.rows import COLUMNS, WRENCH
 from bcppl.distributions.manifold import Gaps
@@ -61,7 +61,7 @@ def lines_at(gaps: Gaps, pose: Tensor, rows: Tensor, bench: LinearErrors) -> Lin
         bench: the errors that all touches share.
     """
     late, effect = bench.late_effects(rows)
-    late, effect = moved((late, effect), gaps.distance.device)
+    late, effect = to_device((late, effect), gaps.distance.device)
     gradient = gaps.gradient(pose)
     # Without errors nothing reads the slope.
     slope = _by_twist_of_peg(gradient, pose, rows[:, :7]) if bench.errors else torch.zeros_like(gradient)
@@ -118,7 +118,7 @@ def _by_twist_of_peg(gradient: Tensor, part: Tensor, peg: Tensor) -> Tensor:
     given, part_turn, frame, peg_turn, peg_frame = (np.ascontiguousarray(numbers(each)) for each in tensors)
     slope = np.empty(tuple(gradient.shape))
     _turned(given, part_turn, frame, peg_turn, peg_frame, slope)
-    return beside(slope, gradient)
+    return on_device_of(slope, gradient)
 
 
 @compiled

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from bcppl.devices import beside, is_on_host
+from bcppl.devices import is_on_host, on_device_of
 from bcppl.distributions.episodes.couples import MeasuresWitness
 from bcppl.distributions.episodes.displaced import Lines, lines_at
 from bcppl.distributions.episodes.filter.alike import AlikeBranches, begun_alike, filtered_alike
@@ -92,7 +92,7 @@ class FilteredEpisodes(PredictedEpisodes):
             start = begun_alike(prior, self.pose) if self._is_alike else begun(prior, len(self.pose))
             return Linearised(start, self._errors_before), rows
         branches = self._known(rows[:place], after).branches
-        errors = (beside(each, self.pose) for each in moments(branches.on_host))
+        errors = (on_device_of(each, self.pose) for each in moments(branches.on_host))
         return Linearised(branches, Spread(*errors)), rows[place:]
 
     @property
@@ -109,14 +109,14 @@ class FilteredEpisodes(PredictedEpisodes):
     def _errors_before(self) -> Spread:
         """What the shared errors may be before any row."""
         count, (means, variances) = len(self.pose), (self.bench.means, self.bench.variances)
-        means, variances = beside(means, self.pose), beside(variances, self.pose)
+        means, variances = on_device_of(means, self.pose), on_device_of(variances, self.pose)
         return Spread(means.expand(count, -1), torch.diag(variances).expand(count, -1, -1))
 
     def _variance(self, columns: Tensor, rows: Tensor) -> Tensor:
         """Variances (N, D, R) of gaps a priori, without what the contact's compliance adds."""
         own = rows[:, NOISE] ** 2 + self.blur**2 + self.drift**2 + self.shared**2
-        variances = beside(self.bench.variances, columns)
-        return beside(own, columns) + (columns**2 * variances).sum(dim=-1)
+        variances = on_device_of(self.bench.variances, columns)
+        return on_device_of(own, columns) + (columns**2 * variances).sum(dim=-1)
 
     @property
     def _every(self) -> tuple[Hypothesis, ...]:

@@ -12,7 +12,7 @@ from scipy.special import bdtrc
 from torch import Tensor
 
 from bcppl import poses
-from bcppl.devices import beside, numbers
+from bcppl.devices import numbers, on_device_of
 from bcppl.distributions.checks import Check, chi_square
 from bcppl.distributions.episodes.couples import coupled, log_blocked
 from bcppl.distributions.episodes.displaced import lines_at
@@ -103,7 +103,7 @@ class ContactEpisodes(FilteredEpisodes):
         if len(given) == len(rows):
             return self.pose.new_zeros(len(self.pose))
         before = self.branches(given).log_evidence
-        evidence = beside(self.branches(rows, given).log_evidence - before, self.pose)
+        evidence = on_device_of(self.branches(rows, given).log_evidence - before, self.pose)
         pressed = coupled(rows[len(given) :])
         if self.solids is None or not len(pressed):
             return evidence
@@ -199,7 +199,7 @@ class ContactEpisodes(FilteredEpisodes):
         turn = poses.rotation_matrix(world_from_peg)
         measured = world_from_peg.expand(*twist.shape[:-1], 7)
         true = poses.retract(measured, torch.cat([twist[..., :3] @ turn.T, twist[..., 3:]], dim=-1))
-        part = beside(self.pose, twist)[:, None].expand(*twist.shape[:-1], 7)
+        part = on_device_of(self.pose, twist)[:, None].expand(*twist.shape[:-1], 7)
         return poses.compose(measured, poses.compose(poses.inverse(true), part))
 
     def predictive_check(self, value: Tensor, replicas: Callable[[], Any]) -> Check | None:
@@ -234,7 +234,7 @@ class ContactEpisodes(FilteredEpisodes):
     def _spread_at(self, gaps: Gaps, rows: Tensor) -> Tensor:
         """Standard deviations (N, R) of the gaps of rows without contact, a priori."""
         prior, lines = self._prior(0), lines_at(gaps, self.pose, rows, self.bench)
-        weights = beside(np.bincount(prior.delay, np.exp(prior.log_weight)), self.pose)
+        weights = on_device_of(np.bincount(prior.delay, np.exp(prior.log_weight)), self.pose)
         variances = self._variance(lines.columns, rows) + lines.moved**2
         return torch.einsum("d,ndr->nr", weights, variances).sqrt()
 

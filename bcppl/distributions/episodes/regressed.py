@@ -23,7 +23,7 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.arrays import Array
 from bcppl.compiled import compiled
-from bcppl.devices import HOST, beside, moved, numbers
+from bcppl.devices import HOST, numbers, on_device_of, to_device
 from bcppl.distributions.episodes.displaced import Lines
 from bcppl.distributions.episodes.linear_errors import LinearErrors
 from bcppl.distributions.manifold import MeasuresGap
@@ -63,7 +63,7 @@ def regressed(gap: MeasuresGap, pose: Tensor, rows: Tensor, bench: LinearErrors,
         bench: the errors that all touches share.
         errors: what they may be.
     """
-    late, effect = moved(bench.late_effects(rows), pose.device)
+    late, effect = to_device(bench.late_effects(rows), pose.device)
     by, turn = bench.effect_again(rows).twist, poses.rotation_matrix(rows[:, :7])  # (R, 6, M), (R, 3, 3)
     shape = (len(pose), len(rows))
     middle, slope, residual = np.empty(shape), np.empty((*shape, 6)), np.empty((*shape, 6))
@@ -71,13 +71,13 @@ def regressed(gap: MeasuresGap, pose: Tensor, rows: Tensor, bench: LinearErrors,
     most = max(1, _PEGS // (len(rows) * len(_POINTS)))
     for first in range(0, len(pose), most):
         own = slice(first, first + most)
-        errors_here = moved(Spread(errors.mean[own], errors.covariance[own]), HOST)
+        errors_here = to_device(Spread(errors.mean[own], errors.covariance[own]), HOST)
         twist, root, peg = _pegs(by, turn, rows[:, :7], errors_here)
-        pegs = beside(peg.flatten(1, 2), pose)
+        pegs = on_device_of(peg.flatten(1, 2), pose)
         distance = numbers(gap(pose[own], pegs).distance).reshape(*peg.shape[:3])
         _fitted(distance, twist, root, middle[own], slope[own], residual[own])
-    fitted = [beside(each, pose) for each in (middle, slope, residual)]
-    gradient = _by_part(fitted[1], pose, beside(rows[:, :7], pose), beside(turn, pose))
+    fitted = [on_device_of(each, pose) for each in (middle, slope, residual)]
+    gradient = _by_part(fitted[1], pose, on_device_of(rows[:, :7], pose), on_device_of(turn, pose))
     return Lines(fitted[0], fitted[1], gradient, late, *effect, fitted[2])
 
 

@@ -9,7 +9,7 @@ from pyro.distributions import TorchDistribution
 from torch import Tensor
 from torch.distributions import constraints
 
-from bcppl.devices import moved
+from bcppl.devices import to_device
 from bcppl.poses import Freedom
 
 # A held axis may stray by rounding over thousands of moves, never by a nanometre.
@@ -36,7 +36,7 @@ class PoseDistribution(TorchDistribution):
         new = type(self).__new__(type(self))
         new.__dict__.update(
             {
-                name: moved(value, device) if isinstance(value, Tensor) else value
+                name: to_device(value, device) if isinstance(value, Tensor) else value
                 for name, value in self.__dict__.items()
             }
         )

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.special import log_ndtr
 
 from bcppl import poses
-from bcppl.devices import beside, numbers
+from bcppl.devices import numbers, on_device_of
 from bcppl.distributions.poses.base import PoseDistribution
 from bcppl.distributions.poses.normal import NormalPose
 
@@ -68,7 +68,7 @@ class BoxedNormal(PoseDistribution):
             # distribution function is 0 by rounding beyond eight standard deviations, its logarithm is not.
             below, beyond = log_ndtr(first) + torch.log1p(-within), log_ndtr(last) + within.log()
             quantile = ndtri_exp(numbers(torch.logaddexp(below, beyond).detach()))
-            drawn = beside(quantile, first).clamp(first, last)
+            drawn = on_device_of(quantile, first).clamp(first, last)
             score[..., axis] = torch.where(flip, -drawn, drawn)[..., 0]
         pose = poses.retract(self.center, (scale @ score[..., None])[..., 0])
         # At an end of the box the sum of centre and deviation may round to outside.

@@ -12,7 +12,7 @@ from torch import Tensor
 from bcppl import poses, quaternions
 from bcppl.arguments import number_within
 from bcppl.arrays import Array
-from bcppl.devices import beside, numbers
+from bcppl.devices import numbers, on_device_of
 from bcppl.distributions.parameters import Range
 from bcppl.distributions.poses.base import HELD, PoseDistribution, is_unit
 from bcppl.errors import InputError
@@ -139,7 +139,7 @@ def _haar_angle(shape: torch.Size, largest: float) -> Tensor:
     uniform = torch.rand(*shape, dtype=torch.float64)
     cumulative = _beyond_sine(table)
     angle = np.asarray(np.interp(numbers(uniform) * cumulative[-1], cumulative, table))
-    return beside(angle, uniform)
+    return on_device_of(angle, uniform)
 
 
 def _beyond_sine(angle: Array) -> Array:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from bcppl import poses, warp_arrays
 from bcppl.arrays import Array
-from bcppl.devices import beside, numbers
+from bcppl.devices import numbers, on_device_of
 from bcppl.geometry.distance import closed_mesh
 from bcppl.geometry.gap.distance_grid import RefinedGrid, distance_grid
 from bcppl.geometry.gap.frames import Frames
@@ -216,7 +216,7 @@ class WarpGap(PegGap):
             turns = [poses.rotation_matrix(each) for each in (part, peg)]
             distance, witness, normal = self._launch(turns[0], part[:, :3], turns[1], peg[..., :3])
             found = (distance.double(), witness.double() + self._middle, normal.double())
-        return Gap(*(beside(each, world_from_part) for each in found))
+        return Gap(*(on_device_of(each, world_from_part) for each in found))
 
     def evaluate(self, part: Frames, peg: Frames) -> tuple[Array, Array, Array]:
         """The fields of `Gap` as arrays, at frames (N,) of the part and (T,) or (N, T) of the peg."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from bcppl.devices import beside, on_host
+from bcppl.devices import on_device_of, on_host
 from bcppl.distributions.parameters import COUNT, IF_GIVEN, POSITIVE, PROBABILITY, check_parameters, within
 from bcppl.sensors.likelihoods.viewpoints import Sighting
 
@@ -68,4 +68,4 @@ class CameraSettings:
             whole = self.bias_covariance(len(before) + 1)
             gain = torch.linalg.solve(whole[:-1, :-1], whole[:-1, -1])
         biases = torch.stack([torch.as_tensor(each.bias) for each in before], dim=-1)
-        return biases @ beside(gain, biases), math.sqrt(whole[-1, -1] - gain @ whole[:-1, -1])
+        return biases @ on_device_of(gain, biases), math.sqrt(whole[-1, -1] - gain @ whole[:-1, -1])

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from bcppl import poses
-from bcppl.devices import beside, same_random_state, seed_here
+from bcppl.devices import on_device_of, same_random_state, seed_here
 from bcppl.distributions.depth import RobustDepth
 from bcppl.distributions.fitted import FittedMixture, fitted_mixture
 from bcppl.distributions.pose_normals import (
@@ -358,7 +358,7 @@ class ErringCamera:
         off = fit.means[:, :6] + away[..., None] * both / own[:, None]
         covariances = fit.covariances[:, :6, :6] - both[:, :, None] * both[:, None] / own[:, None, None]
         return GaussianMixture(
-            poses.retract(beside(self.prior.center, off), off),
+            poses.retract(on_device_of(self.prior.center, off), off),
             covariances.expand(len(bias), -1, 6, 6),
             fit.log_weights - 0.5 * (away.square() / own + own.log()),
         )

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.special import log_ndtr
 
 from bcppl.arrays import Array, Indices
-from bcppl.devices import beside, numbers
+from bcppl.devices import numbers, on_device_of
 from bcppl.distributions.episodes.filter.branches import OF_CONTACT, Branches, Prior, Segments
 from bcppl.distributions.episodes.filter.switching_filter import BETWEEN, CLEAR, FAINT, RUBBING
 
@@ -66,7 +66,7 @@ class AlikeBranches:
 
 def begun_alike(prior: Prior, pose: Tensor) -> AlikeBranches:
     """The hypotheses of the particles at poses (N, 7) before the first row."""
-    log_weight = beside(np.asarray(prior.log_weight), pose).expand(len(pose), -1)
+    log_weight = on_device_of(np.asarray(prior.log_weight), pose).expand(len(pose), -1)
     shape, sizes = log_weight.shape, (OF_CONTACT, (OF_CONTACT, OF_CONTACT), 0)
     return AlikeBranches(log_weight, *(log_weight.new_zeros(*shape, *np.atleast_1d(each)) for each in sizes))
 
@@ -88,7 +88,7 @@ def filtered_alike(
     free: list[int] = []
 
     def put(values: Array | Indices) -> Tensor:
-        return beside(np.ascontiguousarray(values), distance)
+        return on_device_of(np.ascontiguousarray(values), distance)
 
     # Of many hypotheses few differ in the noise of a row.
     noises, whose = np.unique(np.sqrt(segments.own), axis=0, return_inverse=True)
