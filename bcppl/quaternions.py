@@ -63,6 +63,11 @@ def conjugate(quaternion: Tensor) -> Tensor:
     return quaternion * constant(_CONJUGATE, quaternion)
 
 
+def wrapped_angle(angle: Tensor) -> Tensor:
+    """Angles (...,) in [-pi, pi), radians."""
+    return torch.remainder(angle + math.pi, 2.0 * math.pi) - math.pi
+
+
 def from_rotation_vector(vector: Tensor) -> Tensor:
     """The quaternion (..., 4) of a rotation vector (..., 3)."""
     half = torch.linalg.vector_norm(vector, dim=-1, keepdim=True) / 2

@@ -204,7 +204,7 @@ def least(of_points: Tensor, covariance: Tensor) -> float:
     return 1e3 * float(torch.einsum("kij,dj->dki", of_points, drawn).norm(dim=-1).mean())
 
 
-def coverage(several: Sequence[Pose], mass: int, region: int) -> float:
+def coverage(several: Sequence[Pose], region: int, mass: int) -> float:
     """The share, %, of poses whose region of a mass holds the truth: both by their places in `Pose.holds`."""
     return 100.0 * float(np.mean([pose.holds[mass][region] for pose in several]))
 
@@ -219,7 +219,7 @@ def line(name: str, several: Sequence[Pose]) -> list[Any]:
         float(np.nanmedian([pose.add / pose.bound for pose in several])),
         float(np.median([pose.translation for pose in several])),
         float(np.median([pose.rotation for pose in several])),
-        *[f"{coverage(several, 0, r):.0f} / {coverage(several, 1, r):.0f}" for r in range(2)],
+        *[f"{coverage(several, r, 0):.0f} / {coverage(several, r, 1):.0f}" for r in range(2)],
     ]
 
 
@@ -232,7 +232,7 @@ def rows_of(name: str, task: Task, several: Sequence[Outcome], clearances: Seque
         there: list[Pose] = [getattr(one, which) for one in several]
         for r, region in enumerate(("translation", "rotation")):
             for k, mass in enumerate(MASSES):
-                share = coverage(there, k, r)
+                share = coverage(there, r, k)
                 label = f"{name}: {100 * mass:.0f} % region of the {which} {region} holds the truth"
                 low, high = WITHIN[mass] if task.scale <= 1.0 else (LEAST if mass == 0.9 else 0.0, 100.0)
                 rows += [

@@ -18,6 +18,7 @@ import torch
 from scipy.optimize import minimize_scalar
 from torch import Tensor
 
+from bcppl import quaternions
 from bcppl.distributions.poses import prior_from_guess
 from bcppl.distributions.touch import Path
 from bcppl.distributions.touch.direction import scale_of
@@ -132,10 +133,10 @@ def estimate_settings(recording: Recording, **settings: Any) -> FingerSettings:
     motions = torch.stack(
         [p.heading(p.locate(tip).travelled, 2.0 * start.spacing) for p, tip in zip(paths, tips, strict=True)]
     )
-    turn = _wrapped(torch.atan2(motions[:, 1], motions[:, 0]) - inward)
+    turn = quaternions.wrapped_angle(torch.atan2(motions[:, 1], motions[:, 0]) - inward)
 
     def error(cone: float) -> Tensor:
-        return _wrapped(angles - inward - cone * torch.tanh(turn / cone))
+        return quaternions.wrapped_angle(angles - inward - cone * torch.tanh(turn / cone))
 
     cone = float(
         minimize_scalar(lambda a: float((error(a) ** 2).sum()), bounds=(0.02, 1.4), method="bounded").x
@@ -153,7 +154,3 @@ def estimate_settings(recording: Recording, **settings: Any) -> FingerSettings:
         free_spread=spread,
     )
     return replace(estimated, **settings)
-
-
-def _wrapped(angle: Tensor) -> Tensor:
-    return torch.remainder(angle + math.pi, 2.0 * math.pi) - math.pi

@@ -42,7 +42,9 @@ def test_infer_runs_it_and_settings_given_win() -> None:
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_particles_are_moved_after_every_exponent_but_the_last(seed: int) -> None:
-    begun = tempered_smc.infer(point_probe.model, short(1), particles=60, seed=seed, sweeps=1, search=0)
+    begun = tempered_smc.infer(
+        point_probe.model, short(1), particles=60, seed=seed, sweeps=1, search_climbs=0
+    )
     _, (_, info) = islice(begun, 2)
     assert info.step.resampled >= len(info.exponents) - 1 > 2
 

@@ -46,7 +46,7 @@ def test_the_same_push_three_times_leaves_the_belief_of_one() -> None:
     recording = load_recording("point_probe_10_pushes")
     once = replace(recording, measurements=recording.measurements[:1])
     thrice = replace(once, measurements=[*once.measurements] * 3)
-    few = {"particles": 15, "sweeps": 1, "search": 0, "always_search": False}
+    few = {"particles": 15, "sweeps": 1, "search_climbs": 0, "always_search": False}
     *_, alone = infer(model, once, **few)
     with pytest.warns(RuntimeWarning, match="counted once"):
         *_, together = infer(model, thrice, **few)

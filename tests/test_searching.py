@@ -70,7 +70,7 @@ def recording(*values: float) -> Any:
 
 
 def last(seed: int, **settings: Any) -> Step:
-    few = {"particles": 40, "sweeps": 4, "search": 40, **settings}
+    few = {"particles": 40, "sweeps": 4, "search_climbs": 40, **settings}
     *_, step = tempered_smc.infer(model, recording(*READINGS), seed=seed, **few)
     return step
 
@@ -92,7 +92,7 @@ def test_a_mode_that_all_particles_left_is_reached_again() -> None:
 
 
 def test_without_a_search_it_depends_on_the_seed() -> None:
-    assert float(last(5, search=0).belief.mean[0]) > 0.4
+    assert float(last(5, search_climbs=0).belief.mean[0]) > 0.4
 
 
 def test_populations_are_joined_by_evidence() -> None:
@@ -185,7 +185,8 @@ def test_only_a_search_ends_at_the_truth_where_directions_are_taken_for_too_exac
     hard = pushes("wood_30_63*", 3, 10)
     scene = point_probe.prepare(hard, direction_spread=0.01)
     ends = [
-        list(tempered_smc.infer(point_probe, hard, seed=seed, search=0, scene=scene))[-1] for seed in range(2)
+        list(tempered_smc.infer(point_probe, hard, seed=seed, search_climbs=0, scene=scene))[-1]
+        for seed in range(2)
     ]
     assert max(off(step, hard.truth) for step in ends) > 20.0
     assert off(list(infer(point_probe, hard, scene=scene))[-1], hard.truth) < 5.0

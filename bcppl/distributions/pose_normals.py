@@ -244,12 +244,12 @@ def transport(first: Tensor, second: Tensor) -> Tensor:
     distance between two random vectors with given dispersion matrices, Linear Algebra and its Applications
     48, 1982.
     """
-    root = _root(first)
+    root = symmetric_root(first)
     back = torch.linalg.inv(root)
-    return back @ _root(root @ second @ root) @ back
+    return back @ symmetric_root(root @ second @ root) @ back
 
 
-def _root(matrix: Tensor) -> Tensor:
+def symmetric_root(matrix: Tensor) -> Tensor:
     """The symmetric root of a symmetric positive matrix."""
     values, vectors = torch.linalg.eigh(0.5 * (matrix + matrix.T))
     return vectors @ torch.diag(values.clamp(min=0.0).sqrt()) @ vectors.T

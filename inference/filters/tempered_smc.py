@@ -101,7 +101,7 @@ def infer(
     share: float | None = None,
     climbs: int = 0,
     conditional: Program | None = None,
-    search: int = 120,
+    search_climbs: int = 120,
     always_search: bool = False,
     scene: Any = None,
     start: Step | None = None,
@@ -123,7 +123,7 @@ def infer(
             between which particles jump (`bcppl.inference.proposals.climbing`; it needs depth images).
         conditional: where depth images depend on other latent poses than the sought one (those at which
             cameras that err see the part), a proposal of the sought pose given these, which jump.
-        search: number of draws of the prior that climb where a measurement surprises all particles
+        search_climbs: number of draws of the prior that climb where a measurement surprises all particles
             (`bcppl.inference.filters.searching`); 0 for no search.
         always_search: search at every measurement; with onsets of touches it costs less than tempering.
         scene: `model.prepare(recording)` unless given.
@@ -165,8 +165,12 @@ def infer(
             share=kept,
         )(population, observed)
 
-    if whole_number("{} climbs are to search", search, least=0) and not isinstance(model.program, Series):
+    if whole_number("{} climbs are to search", search_climbs, least=0) and not isinstance(
+        model.program, Series
+    ):
         near = partial(kernel, model.pose, model.proposals)
         apart = until(distinct=most, most=12)
-        step = Searching(step, model.program, model.pose, near, search, apart, always_search)
+        step = Searching(
+            step, model.program, model.pose, near, climbs=search_climbs, sweeps=apart, always=always_search
+        )
     return smc(model, recording, step=step, particles=particles, seed=seed, scene=scene, start=start)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from bcppl.distributions.pose_normals import symmetric_root
 from bcppl.inference.summaries import weighted_covariance
 
 # The least product of the variances of an axis's particles and of its scores, which is 1 for a normal: of a
@@ -57,7 +58,7 @@ def fisher_covariance(
     bend = (size * bend + prior * torch.diag(of_scores)) / (size + prior) * unit[:, None] * unit
     factor = torch.linalg.cholesky(bend)
     # M = F^-T (F^T S F)^(1/2) F^-1 with G = F F^T.
-    inner = _root(factor.T @ spread @ factor)
+    inner = symmetric_root(factor.T @ spread @ factor)
     half = torch.linalg.solve_triangular(factor.T, inner, upper=True)
     mean = torch.linalg.solve_triangular(factor.T, half.T, upper=True)
     return 0.5 * (mean + mean.T) * unit[:, None] * unit

@@ -15,7 +15,7 @@ from bcppl.poses import as_pose, rotation_matrix
 STANDARD_GRAVITY = (0.0, 0.0, -9.80665)
 FARTHEST_CENTER = 2.0  # m: a centre farther than this from the sensor comes from torques in N mm
 LONGEST_LEVER = 30.0  # in reaches of the peg; torques that need a longer one are in N mm
-TURNED = 0.05  # lower bound of the second singular value of gravity's directions, over gravity
+_TILTED = 0.05  # lower bound of the second singular value of gravity's directions, over gravity
 
 
 @dataclass(frozen=True)
@@ -57,6 +57,15 @@ def gravity_in(world_from_sensor: Array, gravity: tuple[float, float, float] = S
         return np.empty((*pose.shape[:-1], 3))
     turn = Rotation.from_quat(pose.reshape(-1, 7)[:, [4, 5, 6, 3]])
     return np.asarray(turn.inv().apply(gravity)).reshape(*pose.shape[:-1], 3)
+
+
+def tilts_enough(pulls: Array) -> bool:
+    """Whether directions of gravity (K, 3), in a sensor's frame, determine its load's place.
+
+    Those in one plane leave the place along a line undetermined.
+    """
+    values = np.linalg.svd(pulls - pulls.mean(axis=0), compute_uv=False) / np.sqrt(len(pulls))
+    return bool(values[1] >= _TILTED * np.linalg.norm(STANDARD_GRAVITY))
 
 
 def transform_wrench(wrench: Array, to_from_from: Array) -> Array:
@@ -130,9 +139,7 @@ def identify_load(wrench: Array, world_from_sensor: Array) -> LoadEstimate:
     if not np.isfinite(wrench).all():
         raise InputError("a static reading holds a wrench that is not finite; leave it out.")
     pulls = gravity_in(world_from_sensor)
-    values = np.linalg.svd(pulls - pulls.mean(axis=0), compute_uv=False) / np.sqrt(len(pulls))
-    # Directions of gravity in one plane leave the centre's place along a line undetermined.
-    if values[1] < TURNED * np.linalg.norm(STANDARD_GRAVITY):
+    if not tilts_enough(pulls):
         raise InputError(
             "the static readings have the same tilt; tilt the sensor about two axes by 30 degrees or more."
         )

@@ -214,8 +214,7 @@ def tilt_and_yaw(center: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
     )
     x, y, z, w = quaternions.product(first, second).unbind(dim=-1)
     tilt = 2.0 * torch.atan2(torch.hypot(x, y), torch.hypot(z, w))
-    yaw = torch.remainder(2.0 * torch.atan2(z, w) + math.pi, 2.0 * math.pi) - math.pi
-    return tilt, yaw
+    return tilt, quaternions.wrapped_angle(2.0 * torch.atan2(z, w))
 
 
 def prior_from_guess(guess: Any) -> UniformPose | SwingTwistPose:

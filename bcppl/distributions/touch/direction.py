@@ -11,6 +11,7 @@ import torch
 from scipy.optimize import minimize_scalar
 from torch import Tensor
 
+from bcppl import quaternions
 from bcppl.distributions.checks import Check
 from bcppl.distributions.lazy import LazyDistribution
 from bcppl.distributions.touch.outliers import touch_check
@@ -74,7 +75,7 @@ class ForceDirection(LazyDistribution):
         _, normal = distance_at(self.distance, self.pose, tip)
         inward = torch.atan2(-normal[:, 1], -normal[:, 0])
         cone = torch.atan(torch.as_tensor(self.friction, dtype=torch.float64))
-        turn = _wrapped(torch.atan2(self.motion[:, 1], self.motion[:, 0]) - inward)
+        turn = quaternions.wrapped_angle(torch.atan2(self.motion[:, 1], self.motion[:, 0]) - inward)
         # Along a vertical motion friction has no part in the plane: it turns the force to neither side.
         upright = self.motion[:, :2].norm(dim=-1) <= UPRIGHT * self.motion.norm(dim=-1)
         turn = torch.where(upright, 0.0, turn)
@@ -86,7 +87,7 @@ class ForceDirection(LazyDistribution):
         value = value.expand(len(self.pose))
         spread = torch.as_tensor(self.spread, dtype=torch.float64)
         windings = 2.0 * math.pi * torch.arange(-1, 2, dtype=torch.float64)
-        error = (_wrapped(value - expected)[:, None] + windings) / spread[..., None]
+        error = (quaternions.wrapped_angle(value - expected)[:, None] + windings) / spread[..., None]
         near = torch.logsumexp(LOG_PEAK - 2.0 * torch.log1p(error**2 / 3.0), dim=-1) - torch.log(spread)
         near = near - torch.log1p(-_tail(3.0 * math.pi / spread))  # of more windings than these
         even = torch.full_like(expected, -math.log(2.0 * math.pi))
@@ -101,7 +102,7 @@ class ForceDirection(LazyDistribution):
         expected, sided, touched = self._expected()
         if not bool((touched & ~torch.isnan(value)).all()):
             return None
-        error = _wrapped(value - expected).abs() / self.spread
+        error = quaternions.wrapped_angle(value - expected).abs() / self.spread
         return touch_check(torch.where(sided, _tail(error), 1.0), self.outlier)
 
     def sample(self, sample_shape: Any = torch.Size()) -> Tensor:
@@ -112,7 +113,9 @@ class ForceDirection(LazyDistribution):
         angle = expected + self.spread * normal / inverse_scale
         even = 2.0 * math.pi * torch.rand(len(self.pose), dtype=torch.float64)
         stray = torch.rand(len(self.pose), dtype=torch.float64) < self.outlier
-        return torch.where(touched, _wrapped(torch.where(stray | ~sided, even, angle)), torch.nan)
+        return torch.where(
+            touched, quaternions.wrapped_angle(torch.where(stray | ~sided, even, angle)), torch.nan
+        )
 
 
 def scale_of(errors: Tensor) -> float:
@@ -129,8 +132,3 @@ def _tail(error: Tensor) -> Tensor:
     """The probability of a t with 3 degrees of freedom outside +-error, exact and above 0 far off."""
     share = error / math.sqrt(3.0)
     return (2.0 / math.pi) * (torch.atan2(torch.ones_like(share), share) - share / (1.0 + share**2))
-
-
-def _wrapped(angle: Tensor) -> Tensor:
-    """Angles in [-pi, pi), radians."""
-    return torch.remainder(angle + math.pi, 2.0 * math.pi) - math.pi

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple, Protocol
@@ -21,6 +20,7 @@ from bcppl.devices import numbers
 from bcppl.distributions.episodes.filtered import Linearised
 from bcppl.distributions.episodes.rows import COLUMNS, FELT, GIVEN, SECONDS, padded
 from bcppl.distributions.manifold import Gaps, MeasuresGap
+from bcppl.recordings.streams import position_noise
 from bcppl.robot.motion import Probe, ProbeWindow
 from bcppl.sensors.measurements import Measurement
 
@@ -78,16 +78,6 @@ def after_those_before(each: Sequence[tuple[int, Tensor]], room: Sequence[int]) 
         rows[:, GIVEN] = 1.0
         given = torch.cat([given, rows])[-_REMEMBERED:]
     return values
-
-
-def _noise_of(place: Array) -> float:
-    """The noise (m) of positions (T, 3) along an axis, by the median of their second differences.
-
-    A motion that is not smooth over three stamps adds to it.
-    """
-    if len(place) < 10:
-        return math.inf
-    return float(np.median(np.abs(np.diff(place, n=2, axis=0)))) / (0.6745 * 6.0**0.5)
 
 
 class RememberedGaps:
@@ -201,7 +191,9 @@ class ProbeRows:
             end == len(self.probe.stamps),
         )
         stamp = float(
-            np.clip(_noise_of(self._tip(self._pose[so_far])), 0.3 * settings.gap_noise, settings.gap_noise)
+            np.clip(
+                position_noise(self._tip(self._pose[so_far])), 0.3 * settings.gap_noise, settings.gap_noise
+            )
         )
         noise = np.hypot(stamp / np.sqrt(rows.stamps), settings.delay * rows.speed)
         columns = [rows.felt, noise, rows.force, rows.time, rows.episode, np.zeros(len(noise))]

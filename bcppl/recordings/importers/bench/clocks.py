@@ -17,7 +17,7 @@ from bcppl.recordings.importers.bench.configuration.field_types import factor
 from bcppl.recordings.importers.bench.configuration.fields import ClockFields
 from bcppl.recordings.importers.bench.contacts import contacts
 from bcppl.recordings.importers.bench.resting import COMPLIANCES, log_evidence
-from bcppl.recordings.streams import Stream
+from bcppl.recordings.streams import Stream, position_noise
 
 _WITHIN = 0.1  # s: the largest lateness, either way, that is looked for
 _COARSE, _FINE = 0.002, 0.0005  # s between latenesses
@@ -110,8 +110,7 @@ def lateness(force: Stream, position: Stream, within: float, drifts: bool = Fals
         within: the largest lateness, either way, s.
         drifts: whether the clocks drift apart.
     """
-    noise = float(np.median(np.abs(np.diff(position.values, n=2, axis=0)))) / (0.6745 * 6.0**0.5)
-    noise = max(noise, _LEAST_NOISE)
+    noise = max(position_noise(position.values), _LEAST_NOISE)
     felt = list(contacts(force))
     if not felt:
         return None

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from bcppl.arrays import Array, Indices, Mask
 from bcppl.contact.sensing import ToolLoad, identify_load
-from bcppl.contact.sensing.load import TURNED, gravity_in
+from bcppl.contact.sensing.load import STANDARD_GRAVITY, gravity_in, tilts_enough
 from bcppl.errors import InputError
 from bcppl.recordings.importers.bench.configuration.field_types import factor
 from bcppl.recordings.importers.bench.configuration.fields import GravityFields
@@ -73,7 +73,7 @@ def _weight(
         return Weight(ToolLoad(fields.mass, (x, y, z)), f"the stated {fields.mass:g} kg subtracted")
     readings, poses = _blocks(wrench, world_from_peg, stamps)
     turned = _turned(poses)
-    if not _determined(poses):
+    if not tilts_enough(gravity_in(poses)):
         return Weight(
             None,
             f"the tool's tilt varies by {np.degrees(turned):.1f} degrees, too little to identify its "
@@ -99,7 +99,7 @@ def _weight(
 
 
 def _advice(turned: float) -> str:
-    least = 9.80665 * np.sin(0.5 * turned)
+    least = np.linalg.norm(STANDARD_GRAVITY) * np.sin(0.5 * turned)
     return (
         f": a tool of 1 kg then reads up to {least:.1f} N that no contact exerts; state gravity.mass and "
         "gravity.center, or log the tool in free air, tilted about two axes by 30 degrees"
@@ -117,15 +117,9 @@ def _blocks(wrench: Array, world_from_peg: Array, stamps: Array) -> tuple[Array,
 
 def _turned(poses: Array) -> float:
     """The largest angle (rad) between directions of gravity at poses (B, 7), in their frames."""
-    pulls = gravity_in(poses) / 9.80665
+    pulls = gravity_in(poses) / np.linalg.norm(STANDARD_GRAVITY)
     cosine = np.clip(pulls[:: max(1, len(pulls) // 500)] @ pulls.T, -1.0, 1.0)
     return float(np.arccos(cosine.min()))
-
-
-def _determined(poses: Array) -> bool:
-    pulls = gravity_in(poses)
-    values = np.linalg.svd(pulls - pulls.mean(axis=0), compute_uv=False) / np.sqrt(len(pulls))
-    return bool(values[1] >= TURNED * 9.80665)
 
 
 def _without_contact(readings: Array, poses: Array) -> Mask:
