@@ -22,3 +22,8 @@ class NoWeightError(InferenceError):
 
 class NotANumberError(InferenceError):
     """A log-probability is NaN or +inf: a mistake in a program, a distribution or a simulator."""
+
+
+def reason_of(error: BaseException | str) -> str:
+    """The message of an exception in one line without a full stop, or its name where it has none."""
+    return " ".join(str(error).split()).rstrip(".") or type(error).__name__

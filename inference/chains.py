@@ -28,7 +28,7 @@ from torch import Tensor
 
 from bcppl.arguments import latent_address, whole_number
 from bcppl.inference.kernels import Kernel, fitted, halved, halves, moved_by
-from bcppl.inference.kernels.kernel import refuse_other, scattered
+from bcppl.inference.kernels.kernel import refuse_no_kernel, scattered
 from bcppl.inference.population import Population
 from bcppl.inference.progress import watched
 from bcppl.inference.resampling import Scheme, systematic
@@ -94,7 +94,7 @@ def markov_chains(
     Raises:
         InputError: what is given is no kernel, no whole number of moves, or an address is not latent.
     """
-    refuse_other("markov_chains", kernel)
+    refuse_no_kernel("markov_chains", kernel)
     moves = whole_number("chains are to make {} moves", moves)
     every = whole_number("chains are to be recorded every {} moves", every)
     warm_up = whole_number("chains are to warm up for {} moves", warm_up, least=0)

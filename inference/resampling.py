@@ -173,7 +173,7 @@ def always(scheme: Scheme = systematic) -> Resample:
     return resample
 
 
-def check_resample(where: str, resample: object) -> None:
+def refuse_no_resampling(where: str, resample: object) -> None:
     """Check that an argument is a `Resample`, and not a scheme by itself."""
     if not callable(resample) or resample in (systematic, stratified, multinomial, residual, ssp):
         name = getattr(resample, "__name__", type(resample).__name__)

@@ -30,7 +30,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from bcppl.arrays import Array
-from bcppl.errors import InputError
+from bcppl.errors import InputError, reason_of
 from bcppl.robot.kinematics import Robot
 from bcppl.traces import Trace
 
@@ -298,7 +298,7 @@ def read_seatings(folder: str | Path) -> list[Tensor]:
         try:
             read.append(torch.from_numpy(np.loadtxt(file, delimiter=",", ndmin=2)))
         except (OSError, ValueError) as error:
-            reason = " ".join(str(error).split()).rstrip(".")
+            reason = reason_of(error)
             raise InputError(f"{file} must hold rows of joint angles ({reason}); record it again.") from error
         if not bool(torch.isfinite(read[-1]).all()):
             raise InputError(f"{file} holds an angle that is not finite; leave its row out.")

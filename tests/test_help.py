@@ -68,7 +68,7 @@ def test_the_example_is_the_first_block() -> None:
 
 def test_help_of_kernels_lists_none_of_the_language_behind_them() -> None:
     # `scattered` is for who writes a kernel: notebooks/own_kernel.ipynb.
-    assert not {"takes", "refuse_other"}.intersection(import_module("bcppl.inference.kernels").__all__)
+    assert not {"takes", "refuse_no_kernel"}.intersection(import_module("bcppl.inference.kernels").__all__)
 
 
 def test_the_shell_completes_commands() -> None:

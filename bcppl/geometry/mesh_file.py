@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bcppl.errors import InputError
+from bcppl.errors import InputError, reason_of
 from bcppl.plain_xml import refuse_entities
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ def read_mesh(path: Path, process: bool = False) -> trimesh.Trimesh:
         if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
             raise ValueError("a face has no vertices")
     except Exception as error:  # every format has its own reader with its own errors
-        reason = " ".join(str(error).split()) or type(error).__name__
+        reason = reason_of(error)
         raise InputError(
             f"mesh file {path} cannot be read ({reason}); export it again as OBJ or STL."
         ) from error

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import h5py
 
-from bcppl.errors import InputError
+from bcppl.errors import InputError, reason_of
 from bcppl.recordings import structure
 from bcppl.visible_text import visible
 
@@ -137,7 +137,7 @@ def opened(
 
 def one_line(error: BaseException) -> str:
     """The message of an error in one line that can be printed, without its full stop."""
-    return visible(" ".join(str(error).split()).rstrip(".") or type(error).__name__)
+    return visible(reason_of(error))
 
 
 def _checksum(path: Path) -> tuple[str, bool | None]:

@@ -22,7 +22,7 @@ from pytorch_kinematics.urdf_parser_py import urdf
 from scipy.spatial.transform import Rotation
 
 from bcppl.arrays import Array
-from bcppl.errors import InputError
+from bcppl.errors import InputError, reason_of
 from bcppl.geometry.mesh_file import read_mesh
 from bcppl.geometry.parts import Part
 from bcppl.plain_xml import refuse_entities
@@ -118,7 +118,7 @@ def read(file: str | Path) -> Description:
     except InputError as error:
         raise (error if str(file) in str(error) else InputError(f"{file}: {error}")) from error
     except Exception as error:  # the parser raises ParseError, XMLSyntaxError, AssertionError, ValueError
-        reason = " ".join(str(error).split()) or type(error).__name__
+        reason = reason_of(error)
         raise InputError(
             f"{file} cannot be read as a URDF ({reason}); "
             "give the robot's URDF file, expanded where it is a xacro."

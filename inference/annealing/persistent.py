@@ -18,7 +18,7 @@ from bcppl.arguments import number_within, whole_number
 from bcppl.inference.exponents import exponent_after
 from bcppl.inference.filters.step import StepInfo, Stepped
 from bcppl.inference.kernels import Kernel, Until, moved_by
-from bcppl.inference.kernels.kernel import refuse_other
+from bcppl.inference.kernels.kernel import refuse_no_kernel
 from bcppl.inference.population import Population
 from bcppl.inference.resampling import Scheme, systematic
 from bcppl.inference.targets import POSTERIOR, Target
@@ -62,7 +62,7 @@ def persistent_sampling(
         InputError: what is given is no kernel, or a number is out of range.
         NoWeightError: no particle has any weight.
     """
-    refuse_other("persistent_sampling", kernel)
+    refuse_no_kernel("persistent_sampling", kernel)
     count = whole_number("persistent sampling is to move {} particles", particles)
     share = number_within("persistent sampling is to keep an effective sample size of {} N", share, above=0.0)
     batches = max(1, math.ceil(2.0 * share))

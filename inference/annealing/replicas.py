@@ -17,7 +17,7 @@ from torch import Tensor
 from bcppl.arguments import latent_address, number_within, whole_number
 from bcppl.errors import InputError
 from bcppl.inference.chains import Chains
-from bcppl.inference.kernels.kernel import Kernel, Move, fitted, refuse_other, scattered
+from bcppl.inference.kernels.kernel import Kernel, Move, fitted, refuse_no_kernel, scattered
 from bcppl.inference.population import Population
 from bcppl.inference.progress import watched
 from bcppl.inference.targets import POSTERIOR, Target
@@ -72,7 +72,7 @@ def replica_exchange(
         InputError: what is given is no kernel, a number is out of range, the exponents do not increase to 1,
             there are not as many particles for each exponent, or an address is not latent.
     """
-    refuse_other("replica_exchange", kernel)
+    refuse_no_kernel("replica_exchange", kernel)
     moves = whole_number("replicas are to make {} moves", moves)
     warm_up = whole_number("replicas are to warm up for {} moves", warm_up, least=0)
     ladder = [number_within("a replica is given the exponent {}", e, least=0.0) for e in exponents]

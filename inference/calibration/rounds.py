@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from bcppl.errors import InferenceError, InputError
+from bcppl.errors import InferenceError, InputError, reason_of
 from bcppl.inference.progress import watched
 from bcppl.recordings.hdf5 import replacing
 from bcppl.sweeps import Failure, as_they_end
@@ -70,7 +70,7 @@ def kept(path: Path) -> Arrays | None:
             raise ValueError("it holds something else than arrays")
         return arrays
     except Exception as error:  # zip files and numpy have errors of many types
-        reason = " ".join(str(error).split()) or type(error).__name__
+        reason = reason_of(error)
         raise InputError(f"{path} is no round of a calibration ({reason}); remove it.") from error
 
 

@@ -43,7 +43,7 @@ from bcppl.inference.kernels.jacobian import (
 from bcppl.inference.kernels.kernel import scattered, weighted
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import Fittable, Proposal, program_of
-from bcppl.inference.resampling import Resample, adaptive, check_resample
+from bcppl.inference.resampling import Resample, adaptive, refuse_no_resampling
 from bcppl.traces import Program, Trace, Update, extend, simulate, update
 from bcppl.traces.anticipated import Anticipated
 from bcppl.traces.differentiation.programs import result_with_grad, with_gradients
@@ -139,7 +139,7 @@ def smcp3(pair: Pair, *, resample: Resample | None = None) -> StepFunction:
         The step. It raises what `move_and_weight` raises.
     """
     resample = adaptive() if resample is None else resample
-    check_resample("smcp3", resample)
+    refuse_no_resampling("smcp3", resample)
 
     def step(population: Population, observed: Observed) -> Stepped:
         updated = move_and_weight(population, pair, observed)

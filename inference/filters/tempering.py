@@ -26,9 +26,9 @@ from bcppl.errors import InputError
 from bcppl.inference.exponents import fixed_exponents, next_exponent, resampled_below
 from bcppl.inference.filters.step import Observed, StepInfo, Stepped
 from bcppl.inference.kernels import Kernel, Until, moved_by
-from bcppl.inference.kernels.kernel import refuse_other
+from bcppl.inference.kernels.kernel import refuse_no_kernel
 from bcppl.inference.population import Population
-from bcppl.inference.resampling import Resample, adaptive, check_resample, systematic
+from bcppl.inference.resampling import Resample, adaptive, refuse_no_resampling, systematic
 from bcppl.inference.targets import POSTERIOR, Target, cost_of
 from bcppl.traces import Trace, extend
 
@@ -253,14 +253,14 @@ def tempered(
             resampling.
     """
     if kernel is not None:
-        refuse_other("tempered", kernel)
+        refuse_no_kernel("tempered", kernel)
     kept = share_of(share)
     if not callable(sweeps) and not isinstance(sweeps, Until):
         # Without moves there is no kernel: None.
         sweeps = whole_number("tempering is to move the particles in {} sweeps", sweeps)
     fixed = None if exponents is None else fixed_exponents(exponents)
     if resample is not None:
-        check_resample("tempered", resample)
+        refuse_no_resampling("tempered", resample)
     if rejuvenation is None:
         default = where_left(kept if fixed is None else share_of(0.0))
         rejuvenation = resample_move(kernel, sweeps, default if resample is None else resample, always_move)

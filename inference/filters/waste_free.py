@@ -13,7 +13,7 @@ from bcppl.arguments import number_within, whole_number
 from bcppl.errors import InputError
 from bcppl.inference.filters.tempering import Rejuvenated, Rejuvenation
 from bcppl.inference.kernels import Kernel, fitted, halved, halves
-from bcppl.inference.kernels.kernel import refuse_other, scattered
+from bcppl.inference.kernels.kernel import refuse_no_kernel, scattered
 from bcppl.inference.population import Population, log_pair
 from bcppl.inference.resampling import Scheme, systematic
 from bcppl.inference.targets import Target
@@ -39,7 +39,7 @@ def waste_free_moves(
         InputError: what is given is no kernel, no whole number of chains, or no threshold from 0 to 1.
             When it runs: M does not divide N.
     """
-    refuse_other("waste_free_moves", kernel)
+    refuse_no_kernel("waste_free_moves", kernel)
     chains = whole_number("waste-free SMC is asked for {} chains", chains)
     threshold = number_within("waste-free SMC is given the threshold {}", threshold, least=0.0, most=1.0)
 

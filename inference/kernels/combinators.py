@@ -15,7 +15,7 @@ from torch import Tensor
 
 from bcppl.arguments import whole_number
 from bcppl.errors import InputError
-from bcppl.inference.kernels.kernel import Kernel, Move, fitted, refuse_other, scattered
+from bcppl.inference.kernels.kernel import Kernel, Move, fitted, refuse_no_kernel, scattered
 from bcppl.inference.population import Population
 from bcppl.inference.targets import Target
 from bcppl.traces import Trace
@@ -59,7 +59,7 @@ def _listed(name: str, kernels: Sequence[Kernel | Sequence[Kernel]]) -> list[Ker
     if not listed:
         raise InputError(f"{name} is given no kernel; give one or more.")
     for each in listed:
-        refuse_other(name, each)
+        refuse_no_kernel(name, each)
     return listed
 
 
@@ -131,6 +131,6 @@ def repeat(kernel: Kernel, times: int) -> Kernel:
     Raises:
         InputError: the times are no whole number, 1 or more.
     """
-    refuse_other("repeat", kernel)
+    refuse_no_kernel("repeat", kernel)
     times = whole_number("a kernel is to be repeated {} times", times)
     return _one_after_another([kernel], lambda count: [0] * times)

@@ -28,7 +28,7 @@ Kernel = Callable[[Population], Move]
 
 def fitted(kernel: Kernel, population: Population) -> Move:
     """The move of a kernel that has learned from a population."""
-    refuse_other("a population", kernel)
+    refuse_no_kernel("a population", kernel)
     population = weighted(population)
     try:
         move = kernel(population)
@@ -54,7 +54,7 @@ def weighted(population: Population) -> Population:
 WRAP = "wrap a proposal in metropolis_hastings(...)"
 
 
-def refuse_other(where: str, kernel: Any) -> None:
+def refuse_no_kernel(where: str, kernel: Any) -> None:
     """Refuse what cannot be a kernel."""
     if isinstance(kernel, Fittable):
         given = "a proposal"

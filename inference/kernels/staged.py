@@ -18,7 +18,7 @@ from torch import Tensor
 from bcppl.arguments import number_within, whole_number
 from bcppl.errors import InputError
 from bcppl.inference.kernels.combinators import combined, reversible
-from bcppl.inference.kernels.kernel import Kernel, Move, fitted, refuse_other, scattered
+from bcppl.inference.kernels.kernel import Kernel, Move, fitted, refuse_no_kernel, scattered
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import spread_of
 from bcppl.inference.proposals.coordinates import coordinates_of
@@ -180,7 +180,7 @@ def delayed_acceptance(
             to decide first. When the kernel moves: a pattern fits no address, or the reverse move of a
             proposal reads a site of a later stage.
     """
-    refuse_other("delayed_acceptance", kernel)
+    refuse_no_kernel("delayed_acceptance", kernel)
     stages = whole_number("delayed acceptance is asked for {} stages", stages, least=2)
     if surrogate is not None and (first is not None or stages != 2):
         raise InputError(
@@ -221,7 +221,7 @@ def surrogate_transition(kernel: Kernel, surrogate: Surrogate) -> Kernel:
     Raises:
         InputError: what is given is no kernel, or has a `sequence` that does not read the same backwards.
     """
-    refuse_other("surrogate_transition", kernel)
+    refuse_no_kernel("surrogate_transition", kernel)
     if not reversible(kernel):
         raise InputError(
             "surrogate_transition is given a sequence of kernels, which is not reversible, so that the "

@@ -26,7 +26,7 @@ from bcppl.inference.filters.tempering import (
     where_left,
 )
 from bcppl.inference.kernels import Kernel, Until
-from bcppl.inference.kernels.kernel import refuse_other
+from bcppl.inference.kernels.kernel import refuse_no_kernel
 from bcppl.inference.population import Population
 from bcppl.inference.targets import POSTERIOR
 from bcppl.traces import Program, Trace, assess, generate, propose
@@ -78,7 +78,7 @@ def bridged(
         InputError: what is given is no kernel, a number is out of range, the proposal samples no address, or
             what `importance_sampling` refuses.
     """
-    refuse_other("bridged", kernel)
+    refuse_no_kernel("bridged", kernel)
     kept = share_of(share)
     if not isinstance(sweeps, Until):
         sweeps = whole_number("bridging is to move the particles in {} sweeps", sweeps)

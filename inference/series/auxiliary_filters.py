@@ -22,7 +22,7 @@ from torch import Tensor
 from bcppl.errors import InputError
 from bcppl.inference.filters.step import Observed, StepFunction, StepInfo, Stepped
 from bcppl.inference.population import Population
-from bcppl.inference.resampling import Resample, adaptive, check_resample
+from bcppl.inference.resampling import Resample, adaptive, refuse_no_resampling
 from bcppl.traces import Trace, extend, propose
 
 
@@ -52,7 +52,7 @@ def auxiliary(
         proposal samples an observed address or one that the step does not visit.
     """
     when = adaptive() if resample is None else resample
-    check_resample("auxiliary", when)
+    refuse_no_resampling("auxiliary", when)
 
     def step(population: Population, observed: Observed) -> Stepped:
         start = population.log_evidence

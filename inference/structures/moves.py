@@ -19,7 +19,7 @@ import torch
 from bcppl.arguments import whole_number
 from bcppl.errors import InputError
 from bcppl.inference.kernels import Kernel, Move, Until, moved_by
-from bcppl.inference.kernels.kernel import refuse_other, takes
+from bcppl.inference.kernels.kernel import refuse_no_kernel, takes
 from bcppl.inference.population import Population
 from bcppl.inference.structures.strata import Strata
 from bcppl.inference.targets import Target
@@ -51,7 +51,7 @@ def within(kernel: Kernel, sweeps: int | Until = 1) -> StrataMove:
     Raises:
         InputError: the argument is no kernel.
     """
-    refuse_other("within", kernel)
+    refuse_no_kernel("within", kernel)
 
     def move(strata: Strata, target: Target) -> MovedStrata:
         moved = {

@@ -16,7 +16,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from bcppl.errors import InputError
+from bcppl.errors import InputError, reason_of
 
 WRENCH = "geometry_msgs/msg/WrenchStamped"
 POSE = "geometry_msgs/msg/PoseStamped"
@@ -180,7 +180,7 @@ class Bag:
         return str(self._store.hash_rihs01(kind))
 
     def _damaged(self, error: BaseException | str, what: str = "") -> InputError:
-        cause = " ".join(str(error).split()).rstrip(".") or type(error).__name__
+        cause = reason_of(error)
         place = f"{what}in {self.path}" if what else str(self.path)
         return InputError(f"{place} cannot be read ({cause[:200]}); {_REMEDY}.")
 

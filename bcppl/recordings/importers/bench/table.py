@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from bcppl.arrays import Array
-from bcppl.errors import InputError
+from bcppl.errors import InputError, reason_of
 from bcppl.recordings.array_files import npy, npz
 from bcppl.recordings.hdf5 import one_line
 
@@ -71,7 +71,7 @@ def _csv(path: Path, names: Names) -> Array:
             encoding="utf-8-sig",
         )  # fmt: skip
     except ValueError as error:
-        cause = " ".join(str(error).split()).rstrip(".")
+        cause = reason_of(error)
         raise InputError(
             f"{path} holds what is no number ({cause}); write nan where nothing was measured."
         ) from error

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bcppl.arrays import Array
-from bcppl.errors import InputError
+from bcppl.errors import InputError, reason_of
 from bcppl.recordings.image_files import opened
 
 DEPTHS: dict[str, tuple[str, ...]] = {".png": ("I;16", "I"), ".tif": ("I;16",), ".tiff": ("I;16",)}  # modes
@@ -46,6 +46,6 @@ def pixels(path: Path, modes: Sequence[str]) -> npt.NDArray[Any]:
                 raise ValueError(f"its mode is {image.mode}, not {' or '.join(modes)}")
             return np.asarray(image)
     except Exception as error:  # Pillow raises SyntaxError, struct.error, zlib.error and others
-        reason = getattr(error, "strerror", None) or " ".join(str(error).split()) or type(error).__name__
+        reason = getattr(error, "strerror", None) or reason_of(error)
         what = f"{path} is missing or is no image that can be read ({reason})"
         raise InputError(f"{what}; give the folder of a BOP scene.") from error

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from bcppl.arrays import Array
-from bcppl.errors import InputError
+from bcppl.errors import InputError, reason_of
 from bcppl.recordings import array_files
 from bcppl.recordings.importers.bench.arrays import ArrayLog, Numbers, missing, refuse_axes, table, topics
 from bcppl.recordings.importers.bench.configuration.camera_fields import CameraFields, ImageFields
@@ -176,7 +176,7 @@ def _depth(where: str, counts: Any, fields: CameraFields) -> Array:
 
 
 def _unreadable(path: Path, error: Exception, place: str = "") -> InputError:
-    reason = " ".join(str(error).split()) or type(error).__name__
+    reason = reason_of(error)
     return InputError(
-        f"{path} is no .npz file of plain arrays ({reason.rstrip('.')}{place}); convert the trajectory again."
+        f"{path} is no .npz file of plain arrays ({reason}{place}); convert the trajectory again."
     )
