@@ -23,8 +23,8 @@ from pathlib import Path
 from pickle import PicklingError
 from typing import Any, NamedTuple, TypeVar
 
-from bcppl import strict_json
 from bcppl.errors import InferenceError, InputError
+from bcppl.untrusted import strict_json
 
 Argument = TypeVar("Argument")
 Result = TypeVar("Result")

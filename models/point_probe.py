@@ -18,14 +18,13 @@ import torch
 from scipy.optimize import minimize_scalar
 from torch import Tensor
 
-from bcppl import quaternions
 from bcppl.distributions.poses import prior_from_guess
 from bcppl.distributions.touch import Path
 from bcppl.distributions.touch.direction import scale_of
 from bcppl.errors import InputError
 from bcppl.geometry.distance import SignedDistance
 from bcppl.models.shipped import simulated_in
-from bcppl.poses import compose, inverse, rotation_matrix, transform
+from bcppl.poses import compose, inverse, quaternions, rotation_matrix, transform
 from bcppl.sensors.likelihoods.point_finger import (
     FingerSettings,
     PointFinger,

@@ -236,7 +236,7 @@ def test_nobody_outside_sensors_asks_which_kind_a_measurement_is() -> None:
 @pytest.mark.parametrize(
     ("place", "line"),
     [
-        ("bcppl/poses.py", "from bcppl import models"),
+        ("bcppl/poses/se3.py", "from bcppl import models"),
         ("bcppl/distributions/depth.py", "    from bcppl.rendering.ray_casting import RayCaster"),
         ("models/peg.py", "import bcppl.inference.filters.smc"),
         ("inference/filters/smc.py", "from models import peg"),

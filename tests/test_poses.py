@@ -9,10 +9,10 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch.distributions import MultivariateNormal
 
-from bcppl import poses, quaternions
+from bcppl import poses
 from bcppl.distributions.poses import NormalPose, NormalTwist, SwingTwistPose, UniformPose, tilt_and_yaw
 from bcppl.errors import InputError
-from bcppl.poses import Freedom
+from bcppl.poses import Freedom, quaternions
 
 DRAWS = 400_000
 

@@ -10,7 +10,7 @@ import roma
 import torch
 from torch import Tensor
 
-from bcppl import quaternions
+from bcppl.poses import quaternions
 
 SHAPES = ((), (1,), (75,), (4, 1, 9), (0,))
 SCALES = (0.0, 1e-9, 1e-3, 5e-3, 1.0, 3.0, 10.0)  # rad: to beyond a half turn

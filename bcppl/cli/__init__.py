@@ -14,7 +14,7 @@ import typer
 
 from bcppl.cli.commands import calibrate, insert, live, new, probe, recordings, run, sweep, view
 from bcppl.errors import InferenceError, InputError
-from bcppl.visible_text import visible
+from bcppl.untrusted.visible_text import visible
 
 app = typer.Typer(
     name="bcppl",

@@ -16,7 +16,7 @@ from bcppl import poses
 from bcppl.distributions.support import freedom_of, support_of
 from bcppl.inference.population import Population
 from bcppl.inference.summaries import mean, probabilities, quantiles
-from bcppl.visible_text import visible
+from bcppl.untrusted.visible_text import visible
 
 LIKELIEST = 5  # of a discrete site's values
 ROWS = 12  # of one site's numbers; run.json holds them all

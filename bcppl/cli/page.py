@@ -16,7 +16,7 @@ from bcppl.inference.criticism.nuisances import shared_errors
 from bcppl.inference.population import Population
 from bcppl.recordings import Recording
 from bcppl.sensors.protocol import by_sensor
-from bcppl.visible_text import visible
+from bcppl.untrusted.visible_text import visible
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

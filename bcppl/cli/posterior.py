@@ -10,7 +10,6 @@ from typing import Any
 import torch
 from rich.console import Console
 
-from bcppl import strict_json
 from bcppl.cli import loading
 from bcppl.errors import InputError
 from bcppl.inference.population import Population
@@ -19,6 +18,7 @@ from bcppl.recordings import Recording
 from bcppl.recordings.beliefs import is_belief, load_belief, load_fingerprint, load_label, load_latent
 from bcppl.recordings.fingerprint import is_of
 from bcppl.traces import Model, Series, generate
+from bcppl.untrusted import strict_json
 
 
 @dataclass(frozen=True, eq=False)

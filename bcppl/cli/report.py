@@ -22,7 +22,7 @@ from bcppl.inference.criticism import Explanation, explanations
 from bcppl.inference.planning.insertion import InsertionParameters
 from bcppl.recordings import Recording
 from bcppl.traces import Model
-from bcppl.visible_text import visible
+from bcppl.untrusted.visible_text import visible
 
 WIDTHS = {
     "measurement": 12,

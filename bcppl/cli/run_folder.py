@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bcppl import strict_json
 from bcppl.beliefs import Belief
 from bcppl.cli import latent_sites
 from bcppl.errors import InputError
@@ -24,6 +23,7 @@ from bcppl.recordings.beliefs import load_belief, load_label, save_belief
 from bcppl.recordings.fingerprint import fingerprint
 from bcppl.recordings.hdf5 import replacing
 from bcppl.sensors import sensor_of
+from bcppl.untrusted import strict_json
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -17,13 +17,14 @@ import torch
 import trimesh
 from torch import Tensor
 
-from bcppl import poses, quaternions
+from bcppl import poses
 from bcppl.arguments import number_within
 from bcppl.arrays import Array, Indices, Mask
 from bcppl.compiled import compiled
 from bcppl.contact.half_spaces import project_onto_half_spaces
 from bcppl.geometry.gap import Frames, PegGap, frames_of
 from bcppl.geometry.parts import Part
+from bcppl.poses import quaternions
 from bcppl.robot.commands import interpolated_command
 from bcppl.robot.motion import ProbeWindow
 

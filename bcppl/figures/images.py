@@ -19,7 +19,7 @@ from bcppl.geometry.parts import Part
 from bcppl.rendering.part_renderer import PartRenderer
 from bcppl.rendering.rasterisation import renderer_for
 from bcppl.sensors import DepthImage, View
-from bcppl.visible_text import in_figure
+from bcppl.untrusted.visible_text import in_figure
 
 LARGEST = 10.0  # mm of a residual that the colours tell apart
 

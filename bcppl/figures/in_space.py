@@ -24,7 +24,7 @@ from bcppl.figures.space_elements import (
 from bcppl.geometry.parts import Part
 from bcppl.sensors.candidates import Candidate
 from bcppl.sensors.protocol import FAINT, Drawable, sensor_of
-from bcppl.visible_text import in_figure
+from bcppl.untrusted.visible_text import in_figure
 
 HEAVIEST = 10
 

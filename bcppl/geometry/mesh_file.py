@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bcppl.errors import InputError, reason_of
-from bcppl.plain_xml import refuse_entities
+from bcppl.untrusted.plain_xml import refuse_entities
 
 if TYPE_CHECKING:
     import trimesh

@@ -21,13 +21,13 @@ from typing import Any
 
 import h5py
 
-from bcppl import strict_json
 from bcppl.arguments import whole_number
 from bcppl.errors import InputError
 from bcppl.recordings.hdf5 import created, opened, replacing
 from bcppl.sensors.candidates import Candidate, planner_of
 from bcppl.sensors.layout import Layout
 from bcppl.sensors.protocol import Plannable, sensors
+from bcppl.untrusted import strict_json
 
 FORMAT = "bcppl actions"
 SCHEMA_VERSION = 1

@@ -20,7 +20,7 @@ import h5py
 
 from bcppl.errors import InputError, reason_of
 from bcppl.recordings import structure
-from bcppl.visible_text import visible
+from bcppl.untrusted.visible_text import visible
 
 MARK = b"\nbcppl sha256 "
 SEAL = re.compile(rb"\nbcppl sha256 ([0-9a-f]{64})\n", re.DOTALL)

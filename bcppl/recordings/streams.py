@@ -5,7 +5,6 @@ A slow stream is interpolated at the stamps, a fast one averaged about them.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -47,16 +46,6 @@ class Stream:
     def shifted(self, by: float) -> Stream:
         """The same rows at stamps later by some seconds."""
         return replace(self, times=self.times + by)
-
-
-def position_noise(places: Array) -> float:
-    """The noise (m) of places (T,) or (T, 3) at even stamps, by the median of their second differences.
-
-    A motion that is not smooth over three stamps adds to it. Infinite for fewer than ten.
-    """
-    if len(places) < 10:
-        return math.inf
-    return float(np.median(np.abs(np.diff(places, n=2, axis=0)))) / (0.6745 * 6.0**0.5)
 
 
 def common_stamps(first: Stream, second: Stream, rate: float | None) -> Array:

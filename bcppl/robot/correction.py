@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from bcppl.arrays import Array
 from bcppl.errors import InputError
-from bcppl.plain_xml import refuse_entities
+from bcppl.untrusted.plain_xml import refuse_entities
 
 
 def corrected(file: str | Path, parent_from_child: Mapping[str, Array]) -> str:

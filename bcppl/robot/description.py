@@ -25,7 +25,7 @@ from bcppl.arrays import Array
 from bcppl.errors import InputError, reason_of
 from bcppl.geometry.mesh_file import read_mesh
 from bcppl.geometry.parts import Part
-from bcppl.plain_xml import refuse_entities
+from bcppl.untrusted.plain_xml import refuse_entities
 
 MOVING = ("revolute", "continuous", "prismatic")
 LARGEST = 4 << 20  # bytes of a URDF file: links in memory take tens of times as many

@@ -23,9 +23,9 @@ from bcppl.figures.touches import COLOURS
 from bcppl.geometry.parts import Part
 from bcppl.robot.arm_with_peg import ArmWithPeg
 from bcppl.sensors import Recording
+from bcppl.untrusted.visible_text import visible
 from bcppl.viewer.arm import DrawnArm
 from bcppl.viewer.of_measurements import GAP_UNIT, Bodies, shown
-from bcppl.visible_text import visible
 
 MOST = 2000  # particles of a step that are drawn, the heaviest
 MOST_FACES = 10_000  # of a body that is drawn

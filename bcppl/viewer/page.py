@@ -21,8 +21,8 @@ import numpy as np
 from bcppl.recordings.hdf5 import replacing
 from bcppl.robot.arm_with_peg import ArmWithPeg
 from bcppl.sensors import Recording
+from bcppl.untrusted.visible_text import visible
 from bcppl.viewer.held import History, content
-from bcppl.visible_text import visible
 
 SCRIPTS = ("scene.js", "pictures.js", "page.js", "live.js")
 HEIGHT = 820  # pixels, in a notebook

@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from bcppl import strict_json
 from bcppl.arguments import seed_number, whole_number
 from bcppl.errors import InferenceError, InputError
 from bcppl.inference.arviz import population_of
@@ -31,6 +30,7 @@ from bcppl.inference.calibration.rounds import Arrays, gathered, keep, kept
 from bcppl.inference.population import Population
 from bcppl.inference.resampling import seeded, systematic
 from bcppl.recordings.hdf5 import replacing
+from bcppl.untrusted import strict_json
 
 Inference = Callable[[Any], Any]
 SETTINGS = "settings.json"

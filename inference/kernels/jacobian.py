@@ -21,10 +21,10 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from bcppl import poses, quaternions
+from bcppl import poses
 from bcppl.distributions.support import freedom_of, support_of
 from bcppl.errors import InferenceError, InputError
-from bcppl.poses import Freedom
+from bcppl.poses import Freedom, quaternions
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from bcppl.cli.options import (
 )
 from bcppl.cli.outputs import refuse_overwriting
 from bcppl.errors import InputError
-from bcppl.visible_text import visible
+from bcppl.untrusted.visible_text import visible
 
 if TYPE_CHECKING:
     from rich.table import Table

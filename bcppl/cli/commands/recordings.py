@@ -16,7 +16,7 @@ from bcppl.arguments import LARGEST_SEED
 from bcppl.cli.options import AsJson, Recorded
 from bcppl.cli.outputs import refuse_overwriting
 from bcppl.errors import InputError
-from bcppl.visible_text import visible
+from bcppl.untrusted.visible_text import visible
 
 if TYPE_CHECKING:
     from bcppl.recordings import Recording

@@ -11,7 +11,7 @@ import typer
 from bcppl.arguments import LARGEST_SEED
 from bcppl.cli.options import AsJson, Settings
 from bcppl.errors import InputError
-from bcppl.visible_text import visible
+from bcppl.untrusted.visible_text import visible
 
 if TYPE_CHECKING:
     from bcppl.recordings import Recording

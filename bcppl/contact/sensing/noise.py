@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -60,6 +61,16 @@ def noise_at_rest(wrench: Array) -> WrenchNoise:
     """
     variance = np.asarray(wrench, dtype=np.float64).var(axis=0, ddof=1)
     return WrenchNoise(float(np.sqrt(variance[:3].mean())), float(np.sqrt(variance[3:].mean())))
+
+
+def position_noise(places: Array) -> float:
+    """The noise (m) of places (T,) or (T, 3) at even stamps, by the median of their second differences.
+
+    A motion that is not smooth over three stamps adds to it. Infinite for fewer than ten.
+    """
+    if len(places) < 10:
+        return math.inf
+    return float(np.median(np.abs(np.diff(places, n=2, axis=0)))) / (0.6745 * 6.0**0.5)
 
 
 def variance_gain(sections: Array) -> float:

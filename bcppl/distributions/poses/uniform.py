@@ -9,14 +9,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bcppl import poses, quaternions
+from bcppl import poses
 from bcppl.arguments import number_within
 from bcppl.arrays import Array
 from bcppl.devices import numbers, on_device_of
 from bcppl.distributions.parameters import Range
 from bcppl.distributions.poses.base import HELD, PoseDistribution, is_unit
 from bcppl.errors import InputError
-from bcppl.poses import Freedom
+from bcppl.poses import Freedom, quaternions
 
 ANGLE = Range(least=0.0, most=math.pi)
 SHARE = Range(least=0.0, below=1.0)

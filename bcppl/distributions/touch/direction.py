@@ -11,11 +11,11 @@ import torch
 from scipy.optimize import minimize_scalar
 from torch import Tensor
 
-from bcppl import quaternions
 from bcppl.distributions.checks import Check
 from bcppl.distributions.lazy import LazyDistribution
 from bcppl.distributions.touch.outliers import touch_check
 from bcppl.distributions.touch.placed import LATENT_POSITIVE, OUTLIER, Distance, Placed, Scale, distance_at
+from bcppl.poses import quaternions
 
 # A unit vector with less than this in the world's xy plane has no direction there.
 UPRIGHT = 1e-6

@@ -19,7 +19,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from bcppl import strict_json
 from bcppl.arguments import number_within
 from bcppl.distributions.episodes import (
     ArmCompliance,
@@ -33,6 +32,7 @@ from bcppl.distributions.episodes import (
 )
 from bcppl.distributions.episodes.prior import NOISES
 from bcppl.errors import InputError
+from bcppl.untrusted import strict_json
 
 Point = tuple[float, float, float]
 

@@ -16,11 +16,11 @@ from bcppl.contact.sensing.contact_detection import ContactDetector
 from bcppl.contact.sensing.couple import turn_against
 from bcppl.contact.sensing.episodes import EpisodeExtractor, cell_ends
 from bcppl.contact.sensing.location import ContactSensing
+from bcppl.contact.sensing.noise import position_noise
 from bcppl.devices import numbers
 from bcppl.distributions.episodes.filtered import Linearised
 from bcppl.distributions.episodes.rows import COLUMNS, FELT, GIVEN, SECONDS, padded
 from bcppl.distributions.manifold import Gaps, MeasuresGap
-from bcppl.recordings.streams import position_noise
 from bcppl.robot.motion import Probe, ProbeWindow
 from bcppl.sensors.measurements import Measurement
 

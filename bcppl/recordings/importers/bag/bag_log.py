@@ -24,7 +24,7 @@ from bcppl.recordings.importers.bench.configuration.fields import (
     StreamFields,
 )
 from bcppl.recordings.importers.bench.sources import Files, Shot
-from bcppl.visible_text import visible
+from bcppl.untrusted.visible_text import visible
 
 _STEP = 1000  # messages between which the bar moves
 

@@ -13,7 +13,7 @@ from bcppl.recordings.importers.bag import reading
 from bcppl.recordings.importers.bag.images import encoded
 from bcppl.recordings.importers.bag.reading import Bag, Topic
 from bcppl.recordings.importers.bench.configuration.drafts import GUESS, drafted, offer, refuse_place, spelled
-from bcppl.visible_text import visible
+from bcppl.untrusted.visible_text import visible
 
 _LOOKED_AT = 200  # messages of a topic that a guess is made from
 

@@ -13,11 +13,12 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from bcppl.arrays import Array
+from bcppl.contact.sensing.noise import position_noise
 from bcppl.recordings.importers.bench.configuration.field_types import factor
 from bcppl.recordings.importers.bench.configuration.fields import ClockFields
 from bcppl.recordings.importers.bench.contacts import contacts
 from bcppl.recordings.importers.bench.resting import COMPLIANCES, log_evidence
-from bcppl.recordings.streams import Stream, position_noise
+from bcppl.recordings.streams import Stream
 
 _WITHIN = 0.1  # s: the largest lateness, either way, that is looked for
 _COARSE, _FINE = 0.002, 0.0005  # s between latenesses

@@ -28,11 +28,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from bcppl import strict_json
 from bcppl.arrays import Array
 from bcppl.errors import InputError
 from bcppl.poses import from_rotation_matrix, inverse
 from bcppl.recordings.importers.bop.images import COLOURS, DEPTHS
+from bcppl.untrusted import strict_json
 
 MOST = 1e9  # of any number in the files
 REMEDY = "give the folder of one BOP scene, such as DATASET/test/000001"

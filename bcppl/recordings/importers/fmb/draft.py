@@ -10,7 +10,7 @@ from rich.table import Table
 
 from bcppl.recordings.importers.bench.configuration.drafts import GUESS, drafted, offer, refuse_place, spelled
 from bcppl.recordings.importers.fmb.reading import FORCE, POSE, Trajectory
-from bcppl.visible_text import visible
+from bcppl.untrusted.visible_text import visible
 
 _DEPTH = "_depth"
 _INSERTION = "insert"

@@ -11,7 +11,7 @@ from rich.table import Table
 from bcppl.errors import InputError
 from bcppl.recordings.importers.bench.configuration.drafts import GUESS, drafted, offer, refuse_place, spelled
 from bcppl.recordings.importers.reassemble.reading import Segment, arrays, board, segments, span
-from bcppl.visible_text import visible
+from bcppl.untrusted.visible_text import visible
 
 _INSERTION = "insert"
 

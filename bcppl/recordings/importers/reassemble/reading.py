@@ -18,13 +18,13 @@ from typing import Any
 import h5py
 import numpy as np
 
-from bcppl import strict_json
 from bcppl.arrays import Array
 from bcppl.errors import InputError
 from bcppl.recordings.hdf5 import opened
 from bcppl.recordings.importers.bench.arrays import Numbers, missing, refuse_axes, table, topics
 from bcppl.recordings.importers.bench.configuration.fields import BenchFields
-from bcppl.visible_text import visible
+from bcppl.untrusted import strict_json
+from bcppl.untrusted.visible_text import visible
 
 STATE, STAMPS, SEGMENTS = "robot_state", "timestamps", "segments_info"
 BOARD = "NIST_Board1"

@@ -14,7 +14,7 @@ from bcppl.errors import InputError
 from bcppl.recordings.hdf5 import one_line
 from bcppl.recordings.importers.bench.configuration.fields import BenchFields
 from bcppl.recordings.importers.bench.table import is_number
-from bcppl.visible_text import visible
+from bcppl.untrusted.visible_text import visible
 
 _TYPES = {
     "float_type": "a number",

@@ -1,4 +1,4 @@
-"""The loops of `bcppl.pose_kernels` by Warp, a thread for each row: one launch in place of twenty."""
+"""The loops of `bcppl.poses.kernels` by Warp, a thread for each row: one launch in place of twenty."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from typing import Any
 import warp as wp
 from torch import Tensor
 
-from bcppl import pose_kernels as kernels, warp_arrays
+from bcppl import warp_arrays
+from bcppl.poses import kernels
 
 SMALL = wp.constant(wp.float64(kernels.SMALL))
 ZERO, HALF, ONE, TWO = (wp.constant(wp.float64(x)) for x in (0.0, 0.5, 1.0, 2.0))

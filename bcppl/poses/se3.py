@@ -1,16 +1,4 @@
-"""SE(3): batched poses, their tangent space and their base measure.
-
-A pose is `[x, y, z, qw, qx, qy, qz]`, metres and a unit quaternion, in the last dimension of a float64
-tensor; q and -q are the same pose. A pose is named after the frames that it maps between:
-`world_from_part` maps points of the part's frame to the world's.
-
-The tangent space at a pose is R^3 x so(3), translation and rotation apart: a tangent `[v, w]` moves the
-translation by v (in the frame the pose maps to, metres) and turns the rotation by the rotation vector w
-(in the frame the pose maps from, radians): (t, R) -> (t + v, R Exp(w)).
-
-Every pose density in bcppl is with respect to Lebesgue measure on the free translations times the
-normalised Haar measure on the free rotations, and every one takes its Jacobian from here.
-"""
+"""Poses, their algebra, their tangent space and which axes of them are free: see `bcppl.poses`."""
 
 from __future__ import annotations
 
@@ -21,13 +9,13 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from bcppl import pose_kernels as kernels, quaternions
 from bcppl.arguments import pose_problem
 from bcppl.devices import constant, is_on_host, numbers
 from bcppl.errors import InputError
-from bcppl.pose_kernels import fused
+from bcppl.poses import kernels, quaternions
+from bcppl.poses.kernels import fused
 
-LOG_8_PI_SQUARED = math.log(8.0 * math.pi**2)
+_LOG_8_PI_SQUARED = math.log(8.0 * math.pi**2)
 
 
 _XYZW = torch.tensor([4, 5, 6, 3])  # of a pose
@@ -202,7 +190,7 @@ def log_haar_density_of_rotation_vector(angle: Tensor) -> Tensor:
     Groups, vol. 2, 10.6. Angles may exceed pi (further windings); at 2 pi k, k > 0, it is -inf.
     """
     half = 0.5 * angle
-    return 2.0 * torch.log(torch.sinc(half / math.pi).abs()) - LOG_8_PI_SQUARED
+    return 2.0 * torch.log(torch.sinc(half / math.pi).abs()) - _LOG_8_PI_SQUARED
 
 
 _AXES = {"x": 0, "y": 1, "z": 2}

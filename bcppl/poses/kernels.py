@@ -49,7 +49,7 @@ def fused(kernel: Kernel, first: Tensor, second: Tensor, *shape: int) -> Tensor 
             for each in (first, second)
         )
     if there:
-        from bcppl.warp_poses import fused_there
+        from bcppl.poses.warp import fused_there
 
         one, other = (each.reshape(-1, each.shape[-1]) for each in (first, second))
         rows = max(len(one), len(other)) if batch.numel() else 0
