@@ -84,7 +84,7 @@ def test_the_truth_is_the_likeliest_with_its_own_bias() -> None:
 def test_camera_and_bias_are_estimated_jointly() -> None:
     scene, seen = drawn(0.012, widening=0.0, effective_pixels=1000.0)
     torch.manual_seed(0)
-    moves = mixture([kernel("camera"), metropolis_hastings(along_optical_axis)], [0.6, 0.4])
+    moves = mixture([kernel("camera"), metropolis_hastings(along_optical_axis)], weights=[0.6, 0.4])
     population, _ = tempered_importance_sampling(arm_in_view, (scene, 2), seen, 32, tempered(moves, sweeps=3))
     off = poses.local(TRUTH, population.belief("camera").mean)
     before = poses.local(TRUTH, torch.from_numpy(near_the_truth(0.03, 0.05).world_from_part))

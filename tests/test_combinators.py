@@ -72,7 +72,7 @@ SHORT, FRESH = metropolis_hastings(short), metropolis_hastings(fresh)
 COMBINED: dict[str, Kernel] = {
     "sequence": sequence(SHORT, FRESH),
     "cycle": cycle(SHORT, FRESH, SHORT),
-    "mixture": mixture([SHORT, FRESH], [1.0, 3.0]),
+    "mixture": mixture([SHORT, FRESH], weights=[1.0, 3.0]),
     "repeat": repeat(SHORT, 3),
     "nested": mixture([cycle(SHORT, repeat(FRESH, 2)), sequence(FRESH)]),
 }
@@ -153,12 +153,14 @@ def test_acceptance_is_the_mean_over_what_was_tried() -> None:
 
 def test_mixture_draws_for_each_particle_and_puts_it_back_in_its_place() -> None:
     seen: list[Tensor] = []
-    difference, accepted = moves_of(mixture([adding(1.0, 1.0, seen), adding(2.0, 0.25, seen)], [1.0, 3.0]))
+    difference, accepted = moves_of(
+        mixture([adding(1.0, 1.0, seen), adding(2.0, 0.25, seen)], weights=[1.0, 3.0])
+    )
     share = float((difference.round() == 1.0).double().mean())
     assert share == pytest.approx(0.25, abs=0.03)
     assert torch.equal(accepted, torch.where(difference.round() == 1.0, 1.0, 0.25).double())
     assert sum(len(x) for x in seen) == 4000, "a kernel moves only the particles that drew it"
-    never, _ = moves_of(mixture([adding(1.0, 1.0, []), adding(2.0, 1.0, [])], [0.0, 5.0]))
+    never, _ = moves_of(mixture([adding(1.0, 1.0, []), adding(2.0, 1.0, [])], weights=[0.0, 5.0]))
     assert bool((never.round() == 2.0).all())
 
 
@@ -167,9 +169,9 @@ def test_mixture_draws_for_each_particle_and_puts_it_back_in_its_place() -> None
     [
         (lambda: repeat(SHORT, 0), "repeated 0 times"),
         (lambda: repeat(SHORT, -2), "repeated -2 times"),
-        (lambda: mixture([SHORT, FRESH], [1.0]), "for 2 kernels"),
-        (lambda: mixture([SHORT, FRESH], [1.0, -1.0]), "0 or more"),
-        (lambda: mixture([SHORT], [0.0]), "not all of them 0"),
+        (lambda: mixture([SHORT, FRESH], weights=[1.0]), "for 2 kernels"),
+        (lambda: mixture([SHORT, FRESH], weights=[1.0, -1.0]), "0 or more"),
+        (lambda: mixture([SHORT], weights=[0.0]), "not all of them 0"),
         (lambda: mixture([]), "no kernel"),
         (lambda: sequence(), "no kernel"),
         (lambda: cycle(), "no kernel"),

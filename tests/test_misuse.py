@@ -196,7 +196,7 @@ def test_an_error_of_the_kernel_itself_is_left_alone() -> None:
 @pytest.mark.parametrize(
     ("one", "other"),
     [
-        (mixture([walk, walk], [0.3, 0.7]), mixture(walk, walk, weights=[0.3, 0.7])),
+        (mixture([walk, walk], weights=[0.3, 0.7]), mixture(walk, walk, weights=[0.3, 0.7])),
         (sequence([walk, walk]), sequence(walk, walk)),
         (cycle([walk, walk]), cycle(walk, walk)),
         (hmc(["mu"]), hmc("mu")),

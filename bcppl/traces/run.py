@@ -23,6 +23,7 @@ from torch import Tensor
 from bcppl.arguments import whole_number
 from bcppl.distributions.lazy import LazyDistribution
 from bcppl.distributions.shortcuts import drawn, unvalidated
+from bcppl.distributions.support import Support
 from bcppl.errors import InputError
 from bcppl.traces.carried import Entry, carrying
 from bcppl.traces.dependence.surroundings import surroundings
@@ -33,6 +34,19 @@ from bcppl.traces.values import Value, tensors
 
 Program = Callable[..., Any]
 PARTICLES = "particles"
+
+
+@dataclass(eq=False)
+class Common:
+    """What a trace and those of particles chosen from it have in common, as far as it was asked for.
+
+    Attributes:
+        addresses: in the order of the program, if they were asked for.
+        supports: of latent addresses, where they depend on no value.
+    """
+
+    addresses: tuple[str, ...] | None = None
+    supports: dict[str, Support] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)

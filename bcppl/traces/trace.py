@@ -15,13 +15,12 @@ from torch import Tensor
 from bcppl.distributions.support import Support, support_of
 from bcppl.errors import InputError
 from bcppl.traces.carried import Entry
-from bcppl.traces.common import Common
 from bcppl.traces.dependence.changes import changed
 from bcppl.traces.differentiation.graph import kept
 from bcppl.traces.evaluation import Hiding, log_probability
 from bcppl.traces.explained import hidden_site, other_addresses, refuse_masked
 from bcppl.traces.indexing import Index, aligned, broadcast, particles_at
-from bcppl.traces.run import Program, Run, run
+from bcppl.traces.run import Common, Program, Run, run
 from bcppl.traces.structural import Structure
 from bcppl.traces.values import Value, held, shapes, tensors
 

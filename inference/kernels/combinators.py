@@ -77,23 +77,20 @@ def cycle(*kernels: Kernel | Sequence[Kernel]) -> Kernel:
     return _one_after_another(_listed("cycle", kernels), lambda count: torch.randperm(count).tolist())
 
 
-def mixture(kernels: Sequence[Kernel] | Kernel, *more: Any, weights: Sequence[float] | None = None) -> Kernel:
+def mixture(*kernels: Kernel | Sequence[Kernel], weights: Sequence[float] | None = None) -> Kernel:
     """One of several kernels, drawn for each particle and each move.
 
     Particles stay independent of one another, and a small population sees every kernel; each kernel moves
     only the particles that drew it.
 
     Args:
-        kernels: a list of them, or the first.
-        more: the others; after a list, the weights.
+        kernels: one by one or as a list.
         weights: their probabilities, up to a factor; equal by default.
 
     Raises:
         InputError: the weights are not one for each, finite, and not negative.
     """
-    if isinstance(kernels, Sequence) and len(more) == 1 and weights is None and not callable(more[0]):
-        weights, more = more[0], ()
-    listed = _listed("mixture", (kernels, *more))
+    listed = _listed("mixture", kernels)
     chances = torch.as_tensor([1.0] * len(listed) if weights is None else weights, dtype=torch.float64)
     sound = chances.shape == (len(listed),) and bool((torch.isfinite(chances) & (chances >= 0.0)).all())
     if not sound or not bool(chances.sum() > 0.0):
