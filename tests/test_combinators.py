@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from itertools import pairwise
 
 import pyro
 import pyro.distributions as dist
@@ -12,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from bcppl.distributions.poses import NormalPose
+from bcppl.distributions.poses import NormalPose, UniformPose
 from bcppl.errors import InputError
 from bcppl.inference.kernels import (
     Kernel,
@@ -30,7 +29,7 @@ from bcppl.inference.kernels.kernel import scattered
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import drift
 from bcppl.inference.targets import POSTERIOR, Target
-from bcppl.poses import Freedom, identity
+from bcppl.poses import Freedom, identity, retract
 from bcppl.traces import Trace, simulate
 from tests.invariance import largest_z
 
@@ -122,22 +121,32 @@ def moves_of(kernel: Kernel, count: int = 4000) -> tuple[Tensor, Tensor]:
     return moved["x"] - trace["x"], accepted
 
 
-def test_sequence_keeps_its_order_and_cycle_draws_one_for_each_move() -> None:
-    trace = simulate(lopsided, (), 3)
+def mapping(function: Callable[[Tensor], Tensor]) -> Kernel:
+    """No valid kernel: maps x."""
+    return lambda population: (
+        lambda trace, target: (
+            trace.at({"x": function(trace["x"])}),
+            torch.ones(len(trace), dtype=torch.float64),
+        )
+    )
 
-    def orders(combine: Callable[..., Kernel]) -> set[tuple[float, ...]]:
-        found = set()
-        seen: list[Tensor] = []
-        move = combine(*[adding(step, 1.0, seen) for step in (1.0, 10.0, 100.0)])(Population(trace))
-        for _ in range(60):
-            seen.clear()
-            last = move(trace, POSTERIOR)[0]["x"]
-            path = [*seen, last]
-            found.add(tuple(round(float((b - a)[0])) for a, b in pairwise(path)))
-        return found
 
-    assert orders(sequence) == {(1, 10, 100)}
-    assert len(orders(cycle)) == 6
+def test_sequence_keeps_its_order_and_cycle_draws_one_for_each_particle() -> None:
+    torch.manual_seed(0)
+    trace = simulate(lopsided, (), 4000)
+    steps = [mapping(lambda x: x + 1.0), mapping(lambda x: 3.0 * x), mapping(lambda x: x.square())]
+
+    def offsets(combine: Callable[..., Kernel]) -> list[float]:
+        still = trace.at({"x": torch.zeros_like(trace["x"])})
+        moved, _ = combine(*steps)(Population(still))(still, POSTERIOR)
+        return moved["x"].tolist()
+
+    assert set(offsets(sequence)) == {9.0}
+    drawn = offsets(cycle)
+    # Three of the six orders end at 1, two at 3, one at 9.
+    assert [drawn.count(each) / 4000 for each in (1.0, 3.0, 9.0)] == pytest.approx(
+        [1 / 2, 1 / 3, 1 / 6], abs=0.04
+    )
 
 
 def test_acceptance_is_the_mean_over_what_was_tried() -> None:
@@ -249,6 +258,19 @@ def test_displacement_is_asked_for_on_every_free_axis() -> None:
     assert float(share[0]) == 0.0
     assert float(share[2]) == pytest.approx(0.0, abs=1e-12)
     assert 0.3 < float(share[1]) < 0.7
+
+
+def test_displacement_of_a_free_yaw_is_not_that_across_the_cut() -> None:
+    def program() -> None:
+        pyro.sample("pose", UniformPose(identity(), 0.0, math.pi, "z"))
+
+    torch.manual_seed(5)
+    trace = simulate(program, (), 2000)
+    turn = torch.zeros(2000, 6, dtype=torch.float64)
+    turn[:, 5] = 0.15 * torch.randn(2000, dtype=torch.float64)
+    moved = trace.at({"pose": retract(trace["pose"], turn)})
+    (share,) = displacement(Population(trace), Population(moved))
+    assert float(share) == pytest.approx(0.15**2 / (math.pi**2 / 3), rel=0.15)
 
 
 def particle_by_particle(population: Population, kernel: Kernel) -> Population:

@@ -37,7 +37,7 @@ from bcppl.inference.filters.smcp3 import Pair
 from bcppl.inference.filters.step import Observed, StepFunction, StepInfo, Stepped, descended
 from bcppl.inference.filters.tempering import resample_move, tempered
 from bcppl.inference.filters.view_search import is_refuted, searched_by_climbing
-from bcppl.inference.kernels import Kernel, cycle, metropolis_hastings, sequence, surrogate_transition
+from bcppl.inference.kernels import Kernel, metropolis_hastings, sequence, surrogate_transition
 from bcppl.inference.kernels.kernel import Move
 from bcppl.inference.kernels.rejuvenation import Until, until
 from bcppl.inference.population import Population
@@ -97,7 +97,8 @@ def kernel(pose: str, proposals: Callable[[Any], Sequence[Program]], *, screen: 
         first, *further = (metropolis_hastings(proposal) for proposal in of_pose)
         guided = [first, *_one_of(further)]
         if screen and runs_physics(population.trace):
-            guided = [surrogate_transition(cycle(guided), approximated)]
+            # There and back: an order that all particles share is reversible only so.
+            guided = [surrogate_transition(sequence([*guided, *guided[-2::-1]]), approximated)]
         return sequence([*_one_of(walks), *guided])(population)
 
     return move_of

@@ -7,7 +7,7 @@ proposals. All raise InputError where no kernel is given, or something else, suc
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -15,41 +15,36 @@ from torch import Tensor
 
 from bcppl.arguments import whole_number
 from bcppl.errors import InputError
-from bcppl.inference.kernels.kernel import Kernel, Move, fitted, refuse_no_kernel, scattered
+from bcppl.inference.kernels.kernel import (
+    Kernel,
+    Move,
+    fitted,
+    is_reversible,
+    marked,
+    refuse_no_kernel,
+    scattered,
+)
 from bcppl.inference.population import Population
 from bcppl.inference.targets import Target
 from bcppl.traces import Trace
 
 
-def reversible(kernel: Kernel) -> bool:
-    """Whether a kernel's moves obey detailed balance: all but a `sequence`."""
-    return bool(getattr(kernel, "reversible", True))
-
-
-def combined(kernel: Kernel, parts: Sequence[Kernel], *, symmetric: bool = True) -> Kernel:
-    """A combination, reversible where all its parts and the order of them are."""
-    vars(kernel)["reversible"] = symmetric and all(map(reversible, parts))
-    return kernel
-
-
-def _one_after_another(
-    kernels: Sequence[Kernel], order: Callable[[int], Iterable[int]], *, symmetric: bool = True
-) -> Kernel:
-    """The moves of K kernels by number, in the order that `order(K)` gives for each move."""
+def _one_after_another(kernels: Sequence[Kernel]) -> Kernel:
+    """The moves of several kernels, one after another."""
 
     def together(population: Population) -> Move:
         moves = [fitted(kernel, population) for kernel in kernels]
 
         def move(trace: Trace, target: Target) -> tuple[Trace, Tensor]:
-            total, numbers = torch.zeros(trace.particles, dtype=torch.float64), list(order(len(moves)))
-            for number in numbers:
-                trace, accepted = moves[number](trace, target)
+            total = torch.zeros(trace.particles, dtype=torch.float64)
+            for each in moves:
+                trace, accepted = each(trace, target)
                 total = total + accepted
-            return trace, total / len(numbers)
+            return trace, total / len(moves)
 
         return move
 
-    return combined(together, kernels, symmetric=symmetric)
+    return marked(together, reversible=kernels == kernels[::-1] and all(map(is_reversible, kernels)))
 
 
 def _listed(name: str, kernels: Sequence[Kernel | Sequence[Kernel]]) -> list[Kernel]:
@@ -65,16 +60,31 @@ def _listed(name: str, kernels: Sequence[Kernel | Sequence[Kernel]]) -> list[Ker
 
 def sequence(*kernels: Kernel | Sequence[Kernel]) -> Kernel:
     """One kernel after another, in the order given, one by one or as a list."""
-    listed = _listed("sequence", kernels)
-    return _one_after_another(listed, range, symmetric=listed == listed[::-1])
+    return _one_after_another(_listed("sequence", kernels))
 
 
 def cycle(*kernels: Kernel | Sequence[Kernel]) -> Kernel:
-    """Each kernel once, in an order that is drawn for each move: Tierney's random permutation scan.
+    """Each kernel once, in an order that is drawn for each particle: Tierney's random permutation scan.
 
-    A fixed order of reversible kernels is not reversible; a random one is.
+    A fixed order of reversible kernels is not reversible; a random one is, and one that all particles shared
+    would leave them dependent.
     """
-    return _one_after_another(_listed("cycle", kernels), lambda count: torch.randperm(count).tolist())
+    listed = _listed("cycle", kernels)
+
+    def together(population: Population) -> Move:
+        moves = [fitted(kernel, population) for kernel in listed]
+
+        def move(trace: Trace, target: Target) -> tuple[Trace, Tensor]:
+            order = torch.rand(trace.particles, len(moves)).argsort(dim=1)
+            total = torch.zeros(trace.particles, dtype=torch.float64)
+            for drawn in order.unbind(dim=1):
+                trace, accepted = _each_by_its_own(moves, drawn, trace, target)
+                total = total + accepted
+            return trace, total / len(moves)
+
+        return move
+
+    return marked(together, reversible=all(map(is_reversible, listed)))
 
 
 def mixture(*kernels: Kernel | Sequence[Kernel], weights: Sequence[float] | None = None) -> Kernel:
@@ -103,20 +113,28 @@ def mixture(*kernels: Kernel | Sequence[Kernel], weights: Sequence[float] | None
         moves = [fitted(kernel, population) for kernel in listed]
 
         def move(trace: Trace, target: Target) -> tuple[Trace, Tensor]:
-            drawn = torch.multinomial(chances, trace.particles, replacement=True)
-            accepted = torch.zeros(trace.particles, dtype=torch.float64)
-            for k, each in enumerate(moves):
-                index = (drawn == k).nonzero().flatten()
-                if len(index) == 0:
-                    continue
-                moved, share = each(trace[index], target)
-                trace = scattered(trace, index, moved)
-                accepted[index] = share.to(torch.float64)
-            return trace, accepted
+            return _each_by_its_own(
+                moves, torch.multinomial(chances, trace.particles, replacement=True), trace, target
+            )
 
         return move
 
-    return combined(together, listed)
+    return marked(together, reversible=all(map(is_reversible, listed)))
+
+
+def _each_by_its_own(
+    moves: Sequence[Move], drawn: Tensor, trace: Trace, target: Target
+) -> tuple[Trace, Tensor]:
+    """Particles moved each by the move (N,) that was drawn for it."""
+    accepted = torch.zeros(trace.particles, dtype=torch.float64)
+    for k, move in enumerate(moves):
+        index = (drawn == k).nonzero().flatten()
+        if len(index) == 0:
+            continue
+        moved, share = move(trace[index], target)
+        trace = scattered(trace, index, moved)
+        accepted[index] = share.to(torch.float64)
+    return trace, accepted
 
 
 def repeat(kernel: Kernel, times: int) -> Kernel:
@@ -130,4 +148,4 @@ def repeat(kernel: Kernel, times: int) -> Kernel:
     """
     refuse_no_kernel("repeat", kernel)
     times = whole_number("a kernel is to be repeated {} times", times)
-    return _one_after_another([kernel], lambda count: [0] * times)
+    return _one_after_another([kernel] * times)

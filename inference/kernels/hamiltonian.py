@@ -12,7 +12,7 @@ from bcppl.arguments import number_within, whole_number
 from bcppl.beliefs import normalised
 from bcppl.distributions.support import whole_support
 from bcppl.errors import InputError
-from bcppl.inference.kernels.kernel import Kernel, Move, decided
+from bcppl.inference.kernels.kernel import Kernel, Move, decided, marked
 from bcppl.inference.population import Population
 from bcppl.inference.proposals.coordinates import Unflattened, VectorCoordinates, coordinates_of
 from bcppl.inference.proposals.spread import conditioned, weighted_places
@@ -72,7 +72,7 @@ def hmc(
     def kernel(population: Population) -> Move:
         return hamiltonian_move(named, _factor(named, population), step_size, lengths, jitter)
 
-    return kernel
+    return marked(kernel)
 
 
 def named_addresses(kernel: str, addresses: Sequence[str | Sequence[str]]) -> tuple[str, ...]:

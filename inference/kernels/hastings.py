@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from bcppl.errors import InputError
-from bcppl.inference.kernels.kernel import Kernel, Move, decided, refuse_observed
+from bcppl.inference.kernels.kernel import Kernel, Move, decided, marked, refuse_observed
 from bcppl.inference.population import Population
 from bcppl.inference.proposals.proposal import Proposal, program_of
 from bcppl.inference.targets import Target, visible
@@ -66,4 +66,4 @@ def metropolis_hastings(proposal: Proposal, *learned: Callable[[Population], Any
 
         return move
 
-    return kernel
+    return marked(kernel)

@@ -18,7 +18,7 @@ from bcppl.inference.kernels.jacobian import (
     refuse_leaving,
     refuse_unequal,
 )
-from bcppl.inference.kernels.kernel import Kernel, Move, decided, refuse_observed
+from bcppl.inference.kernels.kernel import Kernel, Move, decided, marked, refuse_observed
 from bcppl.inference.population import Population
 from bcppl.inference.proposals.proposal import Proposal, program_of
 from bcppl.inference.targets import Target, visible
@@ -92,7 +92,7 @@ def involutive(program: Proposal, involution: Involution, *, check: bool = False
 
         return move
 
-    return kernel
+    return marked(kernel)
 
 
 def _mapped(involution: Involution, point: Mapping[Key, Tensor]) -> dict[Key, Tensor]:

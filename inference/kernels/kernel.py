@@ -41,6 +41,21 @@ def fitted(kernel: Kernel, population: Population) -> Move:
     return move
 
 
+def is_reversible(kernel: Kernel) -> bool:
+    """Whether moves obey detailed balance with respect to any target that they are given, a surrogate too.
+
+    Those of `metropolis_hastings`, `hmc` and `involutive` do, and combinations of them but for a `sequence`
+    that does not read the same backwards. A kernel of one's own does if it is `marked` so.
+    """
+    return bool(getattr(kernel, "reversible", False))
+
+
+def marked(kernel: Kernel, *, reversible: bool = True) -> Kernel:
+    """The kernel, with a mark that `is_reversible` reads."""
+    vars(kernel)["reversible"] = reversible
+    return kernel
+
+
 def weighted(population: Population) -> Population:
     """The population that a move learns from: where no particle has weight, all have the same.
 

@@ -123,8 +123,8 @@ def _coordinates(start: Population, now: Population, address: str) -> tuple[Tens
         old, new = (v.reshape(len(now), -1).to(torch.float64) for v in (old, new))
         return new - old, new
     mean = on_device_of(now.belief(address).mean, new)
-    before, after = (freedom.coordinates(poses.local(mean, pose)) for pose in (old, new))
-    return after - before, after
+    # Not the difference of two places about the mean, which jumps where a rotation passes half a turn.
+    return freedom.coordinates(poses.local(old, new)), freedom.coordinates(poses.local(mean, new))
 
 
 def moved_by(population: Population, kernel: Kernel, target: Target, sweeps: int | Until = 1) -> Moved:

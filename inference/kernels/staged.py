@@ -17,8 +17,7 @@ from torch import Tensor
 
 from bcppl.arguments import number_within, whole_number
 from bcppl.errors import InputError
-from bcppl.inference.kernels.combinators import combined, reversible
-from bcppl.inference.kernels.kernel import Kernel, Move, fitted, refuse_no_kernel, scattered
+from bcppl.inference.kernels.kernel import Kernel, Move, fitted, is_reversible, refuse_no_kernel, scattered
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import spread_of
 from bcppl.inference.proposals.coordinates import coordinates_of
@@ -202,7 +201,7 @@ def delayed_acceptance(
 
         return in_stages
 
-    return combined(staged, [kernel])
+    return staged
 
 
 def surrogate_transition(kernel: Kernel, surrogate: Surrogate) -> Kernel:
@@ -211,7 +210,8 @@ def surrogate_transition(kernel: Kernel, surrogate: Surrogate) -> Kernel:
     Liu, Monte Carlo Strategies in Scientific Computing, Springer, 2001, section 9.4.3: the last decision is
     on the ratio of the target to the surrogate, so that costly sites are evaluated once, however many moves
     come before. The moves are to be reversible together, as one Metropolis-Hastings move is, and as several
-    in random order are (`cycle`); a `sequence` of different ones is not.
+    in random order are (`cycle`); a `sequence` of different ones is not, and kernels that decide in stages
+    ask the target itself.
 
     Args:
         kernel: of these moves. A particle is moved as often as `repeat` asks for.
@@ -219,13 +219,14 @@ def surrogate_transition(kernel: Kernel, surrogate: Surrogate) -> Kernel:
             that are moved.
 
     Raises:
-        InputError: what is given is no kernel, or has a `sequence` that does not read the same backwards.
+        InputError: what is given is no kernel, or none that is known to be reversible.
     """
     refuse_no_kernel("surrogate_transition", kernel)
-    if not reversible(kernel):
+    if not is_reversible(kernel):
         raise InputError(
-            "surrogate_transition is given a sequence of kernels, which is not reversible, so that the "
-            "decision about where they led would be biased; put them in a cycle, which draws their order."
+            "surrogate_transition is given a kernel that is not known to be reversible with respect to a "
+            "surrogate, so that the decision about where it led would be biased; give "
+            "metropolis_hastings(...), hmc(...), involutive(...), or a cycle, mixture or repetition of them."
         )
 
     def fit(population: Population) -> Move:
