@@ -39,7 +39,7 @@ from bcppl.inference.arviz import at_draws, check_alike, draw, import_arviz, pop
 from bcppl.inference.population import Population
 from bcppl.inference.progress import watched
 from bcppl.inference.resampling import seeded
-from bcppl.inference.summaries import is_pose, mean
+from bcppl.inference.summaries import is_angle, is_pose, mean
 from bcppl.traces import Trace
 from bcppl.traces.concatenation import concatenated
 
@@ -179,6 +179,8 @@ class Repeated:
         alive = self._alive
         if is_pose(alive[0], address):
             return self.belief(address).mean
+        if is_angle(alive[0], address):
+            return mean(self.pooled, address)
         share = torch.softmax(self.log_evidences[self.log_evidences > -torch.inf], 0)
         return torch.einsum("r,r...->...", share, torch.stack([mean(p, address) for p in alive]))
 
@@ -196,7 +198,7 @@ class Repeated:
         trace = concatenated([replace(p.trace, carried={}) for p in self.populations])
         before = np.cumsum([0, *(int(p.founders.max()) + 1 for p in self.populations)])
         founders = [p.founders + int(b) for p, b in zip(self.populations, before, strict=False)]
-        return Population(trace, self.log_weights, self.log_evidence, torch.cat(founders))
+        return Population(trace, self.log_weights, self.log_evidence, torch.cat(founders), math.inf)
 
     def r_hat(self, draws: int | None = None, seed: int = 0) -> dict[str, Tensor]:
         """Rank-normalised split R-hat (D,) of every latent address: near 1 where the runs agree.

@@ -15,10 +15,13 @@
     print(quantiles(population, "mass", [0.05, 0.95]))
 
 At the address of a pose (its distribution has a `freedom`) these are the belief's: a mean pose (7,), and six
-tangent coordinates at it, metres and radians, 0 along held axes (`bcppl.beliefs`). All raise InputError where
-no latent site has the address, and NoWeightError where no particle has any weight.
+tangent coordinates at it, metres and radians, 0 along held axes (`bcppl.beliefs`). At that of an angle (its
+density is periodic, as von Mises' is) the mean is circular (Mardia and Jupp, Directional Statistics, 2000,
+section 2.2), and the others are of the angles within half a turn of it. All raise InputError where no latent
+site has the address, and NoWeightError where no particle has any weight.
 
-What a program names by `pyro.deterministic` has summaries too.
+What a program names by `pyro.deterministic` has summaries too, as a pose where it holds seven numbers of
+which the last four are a unit quaternion.
 
 Of a long series (`bcppl.traces.Series`) an address may be one with the number of a step, `("x", 3)`: the
 value of each particle's ancestor at that step, with the particle's present weight.
@@ -35,10 +38,11 @@ from torch import Tensor
 
 from bcppl.arguments import latent_address
 from bcppl.beliefs import Belief, normalised, weighted_quantiles
-from bcppl.distributions.support import freedom_of
+from bcppl.distributions.support import freedom_of, is_of_angles
 from bcppl.errors import InputError
 from bcppl.inference.population import Population
 from bcppl.poses import FREE, Freedom
+from bcppl.poses.quaternions import wrapped_angle
 from bcppl.traces import Trace
 from bcppl.traces.series import SeriesTrace
 
@@ -98,8 +102,28 @@ def _freedom(population: Population, address: Address) -> Freedom | None:
     # A pose is one at every step, and the newest distributions are there.
     newest = population.trace
     if name not in newest.choices and name not in then.choices:
-        return None
+        return FREE if _are_poses(then[name]) else None
     return freedom_of((newest if name in newest.choices else then).distributions[name])
+
+
+def _are_poses(values: Tensor) -> bool:
+    return values.shape[1:] == (7,) and bool(((values[:, 3:].norm(dim=1) - 1.0).abs() < 1e-6).all())
+
+
+def is_angle(population: Population, address: Address) -> bool:
+    """Whether a latent address holds angles: its density is periodic."""
+    name, then = _site(population, address)
+    return name in then.choices and is_of_angles(then.distributions[name])
+
+
+def _values(population: Population, address: Address) -> tuple[Tensor, Tensor]:
+    """Values (N, *event) that are no poses, angles within half a turn of the mean; and the mean (*event)."""
+    values, weights = values_at(population, address).to(torch.float64), normalised(population.log_weights)
+    if not is_angle(population, address):
+        return values, torch.einsum("n,n...->...", weights, values)
+    sine, cosine = (torch.einsum("n,n...->...", weights, each) for each in (values.sin(), values.cos()))
+    middle = torch.atan2(sine, cosine)
+    return middle + wrapped_angle(values - middle), middle
 
 
 def _belief(population: Population, address: Address) -> Belief:
@@ -111,8 +135,7 @@ def mean(population: Population, address: Address) -> Tensor:
     """The weighted mean (*event) at an address, in its own units; of a discrete one that of its numbers."""
     if is_pose(population, address):
         return _belief(population, address).mean
-    values = values_at(population, address).to(torch.float64)
-    return torch.einsum("n,n...->...", normalised(population.log_weights), values)
+    return _values(population, address)[1]
 
 
 def covariance(population: Population, address: Address) -> Tensor:
@@ -120,8 +143,7 @@ def covariance(population: Population, address: Address) -> Tensor:
     if is_pose(population, address):
         return _belief(population, address).covariance
     weights = normalised(population.log_weights)
-    values = values_at(population, address).to(torch.float64).reshape(len(weights), -1)
-    return weighted_covariance(values, weights)
+    return weighted_covariance(_values(population, address)[0].reshape(len(weights), -1), weights)
 
 
 def weighted_covariance(values: Tensor, weights: Tensor) -> Tensor:
@@ -140,9 +162,10 @@ def quantiles(population: Population, address: Address, probabilities: object) -
     """
     if is_pose(population, address):
         return _belief(population, address).quantiles(probabilities)
-    return weighted_quantiles(
-        values_at(population, address), normalised(population.log_weights), probabilities
+    values = (
+        _values(population, address)[0] if is_angle(population, address) else values_at(population, address)
     )
+    return weighted_quantiles(values, normalised(population.log_weights), probabilities)
 
 
 class Probabilities(NamedTuple):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import pyro
@@ -13,6 +14,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from bcppl import poses
 from bcppl.inference.design import (
     Ranking,
     discrete_entropy,
@@ -22,7 +24,11 @@ from bcppl.inference.design import (
     neighbour_entropy,
     weight_entropy,
 )
+from bcppl.inference.design.rules import by_reweighted_gain
 from bcppl.inference.population import Population
+from bcppl.models import load_recording, look_and_touch
+from bcppl.sensors import View
+from bcppl.sensors.candidates import with_candidates
 from bcppl.traces import generate, simulate
 from tests.invariance import matrix
 
@@ -357,3 +363,28 @@ def test_measurements_that_were_made_stay() -> None:
     posterior = prior * side[:, 0] / (prior @ side[:, 0])
     assert worst_z(ranking, posterior, [ruler, side]) < 3.0
     assert ranking.entropy == pytest.approx(float(entropy(posterior)))
+
+
+def test_errors_that_another_camera_brings_are_not_observed() -> None:
+    """From six metres farther a camera shows nothing, and its errors are none the wiser either."""
+    recording = load_recording("peg_probe")
+    view = next(m.action for m in recording.measurements if isinstance(m.action, View))
+    world_from_camera = torch.as_tensor(view.camera.world_from_camera)
+
+    def behind(name: str, by: float) -> View:
+        moved = world_from_camera.clone()
+        moved[:3] -= by * poses.rotation_matrix(world_from_camera)[:, 2]
+        return replace(view, camera=replace(view.camera, name=name, world_from_camera=moved.numpy()))
+
+    views = [behind("as recorded", 0.0), behind("far", 6.0)]
+    model = look_and_touch.model
+    scene = model.prepare(with_candidates(recording, views))
+    torch.manual_seed(0)
+    spread = torch.tensor([0.002] * 3 + [0.01] * 3, dtype=torch.float64)
+    near = poses.retract(
+        torch.as_tensor(recording.truth).expand(300, 7), spread * torch.randn(300, 6).double()
+    )
+    trace, _ = generate(model.program, (scene, []), {}, 300, {model.pose: near})
+    ranking = by_reweighted_gain(model.pose, outer_samples=8, seed=0)(Population(trace), views, scene)
+    gains = {each.candidate.camera.name: each.information_gain for each in ranking}
+    assert gains["as recorded"] > 2.0 and abs(gains["far"]) < 0.1

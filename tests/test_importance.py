@@ -197,3 +197,19 @@ def test_chains_are_fitted_once_to_the_others() -> None:
         markov_chains(spying, importance_sampling(program, (1,), {"y": SEEN}, 5), 1, addresses=["y"])
     with pytest.raises(InputError, match="make 0 moves"):
         markov_chains(spying, trace, 0)
+
+
+def test_draws_of_an_lkj_prior_have_its_density() -> None:
+    """Torch's have not from the third row on. Exact values by quadrature over a correlation's density."""
+
+    def correlated() -> None:
+        factor = pyro.sample("factor", dist.LKJCholesky(3, torch.tensor(1.5, dtype=torch.float64)))
+        pyro.sample("y", dist.Normal((factor @ factor.transpose(-1, -2))[..., 2, 1], 0.3))
+
+    torch.manual_seed(0)
+    population = importance_sampling(correlated, (), {"y": torch.tensor(0.9).double()}, 40_000)
+    # The density of each correlation of three at concentration 1.5 is proportional to 1 - r^2.
+    r = torch.linspace(-1.0, 1.0, 20_001, dtype=torch.float64)
+    prior = 0.75 * (1.0 - r.square())
+    exact = torch.trapezoid(prior * dist.Normal(r, 0.3).log_prob(torch.tensor(0.9)).exp(), r)
+    assert math.exp(population.log_evidence) == pytest.approx(float(exact), rel=0.03)

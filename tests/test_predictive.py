@@ -243,3 +243,24 @@ def test_pixels_off_the_part_do_not_surprise_and_a_power_widens_the_spread() -> 
         surprise(belief(placed, (moved, power), {"depth": seen}))["depth"].excess for power in (1.0, 4.0)
     )
     assert whole > 10.0 and quarter == pytest.approx(0.5 * whole, rel=0.05)
+
+
+@pytest.mark.parametrize("plate", [3, 4])
+def test_a_plate_is_checked_as_the_same_numbers_of_one_event(plate: int) -> None:
+    """Also where it has as many entries as particles are checked."""
+    seen = torch.linspace(-1.0, 1.0, plate, dtype=torch.float64)
+
+    def program(event: bool) -> None:
+        middle = pyro.sample("m", dist.Normal(torch.zeros((), dtype=torch.float64), 10.0))
+        if event:
+            pyro.sample("y", dist.Normal(middle[:, None].expand(-1, plate), 2.0).to_event(1))
+            return
+        with pyro.plate("several", plate, dim=-2):
+            pyro.sample("y", dist.Normal(middle, 2.0))
+
+    torch.manual_seed(0)
+    chances = []
+    for event in (True, False):
+        trace, _ = generate(program, (event,), {"y": seen}, 50, {"m": torch.linspace(-1, 1, 50).double()})
+        chances.append(surprise(Population(trace))["y"].probability)
+    assert chances[0] == pytest.approx(chances[1]) and 0.01 < chances[0] < 1.0

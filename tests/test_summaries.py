@@ -10,11 +10,11 @@ import pytest
 import torch
 
 from bcppl import poses
-from bcppl.distributions.poses import UniformPose
+from bcppl.distributions.poses import NormalPose, UniformPose
 from bcppl.errors import InputError
 from bcppl.inference.population import Population
 from bcppl.inference.summaries import covariance, mean, probabilities, quantiles
-from bcppl.traces import Series, extend, generate
+from bcppl.traces import Series, extend, generate, simulate
 
 
 def number(*values: float) -> torch.Tensor:
@@ -180,3 +180,28 @@ def test_what_a_step_determines_is_that_of_each_particles_ancestor() -> None:
         torch.testing.assert_close(trace["square", then], trace["x", then] ** 2)
     found = Population(trace)
     torch.testing.assert_close(mean(found, ("square", 1)), (trace["x", 1] ** 2).mean())
+
+
+def test_summaries_of_an_angle_do_not_depend_on_the_cut() -> None:
+    def pointing() -> None:
+        pyro.sample("angle", dist.VonMises(torch.tensor(math.pi, dtype=torch.float64), 20.0))
+
+    torch.manual_seed(0)
+    population = Population(simulate(pointing, (), 4000))
+    assert abs(math.cos(float(mean(population, "angle"))) + 1.0) < 1e-3
+    assert float(covariance(population, "angle")) == pytest.approx(0.05, rel=0.15)
+    low, high = quantiles(population, "angle", [0.05, 0.95]).tolist()
+    assert high - low == pytest.approx(2 * 1.645 * math.sqrt(0.0513), rel=0.1)
+
+
+def test_a_pose_that_is_determined_is_summed_up_as_one() -> None:
+    def held() -> None:
+        around = NormalPose(poses.identity(), torch.full((6,), 0.01, dtype=torch.float64).diag().square())
+        part = pyro.sample("part", around)
+        flip = torch.where(torch.arange(len(part)) % 2 == 0, 1.0, -1.0)[:, None]
+        pyro.deterministic("again", torch.cat([part[:, :3], flip * part[:, 3:]], dim=1), event_dim=1)
+
+    torch.manual_seed(0)
+    population = Population(simulate(held, (), 200))
+    torch.testing.assert_close(mean(population, "again").abs(), mean(population, "part").abs())
+    torch.testing.assert_close(covariance(population, "again"), covariance(population, "part"))

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.distributions.poses import MixturePose, NormalPose, NormalTwist
+from bcppl.poses import Freedom
 
 TWISTS = torch.tensor(
     [
@@ -132,3 +133,16 @@ def test_a_mixture_of_twists_has_their_density() -> None:
     each = torch.stack([NormalTwist(center, covariance(0.1)).log_prob(at) for center in centers])
     expected = torch.logsumexp(weights.log()[:, None] + each, dim=0)
     torch.testing.assert_close(mixture.log_prob(at), expected)
+
+
+@pytest.mark.parametrize("deviation", [0.3, 1.0, 2.0, 5.0])
+def test_densities_of_wide_rotations_are_normalised(deviation: float) -> None:
+    """Over a whole turn about one axis, by the normalised Haar measure."""
+    angle = torch.linspace(-math.pi, math.pi, 4001, dtype=torch.float64)
+    turned = torch.zeros(4001, 6, dtype=torch.float64)
+    turned[:, 5] = angle
+    normal = NormalPose(
+        poses.identity(), torch.tensor([[deviation**2]], dtype=torch.float64), Freedom("", "z")
+    )
+    density = normal.log_prob(poses.retract(poses.identity(), turned)).exp()
+    assert float(torch.trapezoid(density, angle)) / (2.0 * math.pi) == pytest.approx(1.0, abs=1e-4)

@@ -52,7 +52,9 @@ def _once(scale: Tensor) -> Tensor:
 
 
 def drawn(distribution: Any) -> Tensor | None:
-    """A draw of many normals, as by `centred_normals`; None leaves it to the distribution."""
+    """A draw of many normals (`centred_normals`) or an LKJ prior; None leaves it to the distribution."""
+    if isinstance(distribution, dist.LKJCholesky):
+        return _onion(distribution).sample()
     if type(distribution) is not dist.Normal:
         return None
     mean = distribution.loc
@@ -61,6 +63,17 @@ def drawn(distribution: Any) -> Tensor | None:
     if mean.requires_grad or distribution.scale.requires_grad:
         return None
     return centred_normals(distribution.batch_shape, _once(distribution.scale)).add_(mean)
+
+
+def _onion(distribution: Any) -> Any:
+    """An LKJ prior whose draws have its density.
+
+    Torch's have another one from the third row on: row i of the onion method has a squared length of
+    Beta(i / 2, .), and torch has Beta(i - 1 / 2, .) (Lewandowski, Kurowicka and Joe, Journal of Multivariate
+    Analysis 100, 2009, section 3.2).
+    """
+    first, second = distribution._beta.concentration1, distribution._beta.concentration0
+    return _with(distribution, _beta=torch.distributions.Beta(0.5 * (first + 0.5), second))
 
 
 def centred_normals(shape: Sequence[int], deviation: Tensor | float = 1.0) -> Tensor:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from torch import Tensor
@@ -23,6 +23,13 @@ class Approximated(NamedTuple):
     number: int
     action: Any
     value: Tensor
+
+
+@runtime_checkable
+class SamplesNuisances(Protocol):
+    """A likelihood that samples nuisance parameters with the first measurement that needs them."""
+
+    nuisance_addresses: Collection[str]  # patterns
 
 
 @runtime_checkable

@@ -39,6 +39,7 @@ from bcppl.distributions.poses import NormalPose
 from bcppl.inference.population import Population
 from bcppl.inference.resampling import seeded, systematic
 from bcppl.traces import Trace
+from bcppl.traces.run import inward
 from bcppl.traces.series import SeriesTrace
 from bcppl.traces.verbs import trace_to_device
 
@@ -117,19 +118,22 @@ def surprise(
 
 def _whitened(site: Any, value: Tensor, particles: int) -> Tensor | None:
     """A value as numbers (P, d) that are standard normal; None where the site is not normal."""
+    given = site
     while isinstance(site, dist.Independent | dist.MaskedDistribution | dist.ExpandedDistribution):
         if isinstance(site, dist.MaskedDistribution):
             return None
         site = site.base_dist
-    if isinstance(site, NormalPose):
-        error = site.coordinates(value)
-        scale = torch.linalg.cholesky(site.covariance)
-    elif isinstance(site, torch.distributions.Normal):
-        error = (value - site.mean) / site.stddev
-        return error.double().expand(particles, *error.shape[1:]).reshape(particles, -1)
-    elif isinstance(site, torch.distributions.MultivariateNormal):
-        error, scale = value - site.mean, site.scale_tril
-    else:
+    if not isinstance(site, NormalPose | torch.distributions.Normal | torch.distributions.MultivariateNormal):
         return None
-    white = torch.linalg.solve_triangular(scale, error[..., None], upper=False)[..., 0]
-    return white.double().reshape(particles, -1) if white.shape[0] == particles else None
+    # The particles are the last axis of the batch, behind the plates.
+    batch, value = given.batch_shape, inward(value, given)
+    if isinstance(site, NormalPose):
+        error, scale = site.coordinates(value), torch.linalg.cholesky(site.covariance)
+    elif isinstance(site, torch.distributions.Normal):
+        error, scale = (value - site.mean) / site.stddev, None
+    else:
+        error, scale = value - site.mean, site.scale_tril
+    if scale is not None:
+        error = torch.linalg.solve_triangular(scale, error[..., None], upper=False)[..., 0]
+    whole = error.double().expand(*batch, *error.shape[len(batch) :])
+    return whole.movedim(len(batch) - 1, 0).reshape(particles, -1)

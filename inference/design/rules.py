@@ -22,7 +22,7 @@ from bcppl.inference.planning.motions import expected_contacts
 from bcppl.inference.planning.touching import leading_point
 from bcppl.inference.population import Population
 from bcppl.sensors.candidates import Candidate, action_of, motion_of
-from bcppl.sensors.capabilities import Informative, Linearised, Screens, SharesErrors
+from bcppl.sensors.capabilities import Informative, Linearised, SamplesNuisances, Screens, SharesErrors
 
 # Ranks candidates for a population, given a scene of the model that knows their cameras.
 AcquisitionRule = Callable[[Population, Sequence[Candidate], Any], Ranking]
@@ -80,20 +80,24 @@ def by_reweighted_gain(pose: str, **settings: Any) -> AcquisitionRule:
     """The rule that ranks by the information gain about a pose, by `expected_information_gain`.
 
     It suits likelihoods that cannot be linearised and are wide compared with the distances of particles.
+    Nuisance parameters that a candidate brings, such as the errors of another camera, are not observed.
 
     Args:
         pose: the address of the pose.
-        settings: further arguments; the entropy is `mixture_entropy(pose)`.
+        settings: further arguments; the entropy is `mixture_entropy(pose)`. `latent` are patterns of the
+            addresses that are not observed; by default those of the scene's sensors.
     """
 
     def rule(population: Population, candidates: Sequence[Candidate], scene: Any) -> Ranking:
         _, done = population.trace.args
+        sampling = [x for x in getattr(scene, "likelihoods", {}).values() if isinstance(x, SamplesNuisances)]
+        latent = [address for each in sampling for address in each.nuisance_addresses]
         return expected_information_gain(
             population,
             candidates,
             lambda c: (scene, [*done, action_of(c)]),
             mixture_entropy(pose),
-            **settings,
+            **{"latent": latent, **settings},
         )
 
     return rule

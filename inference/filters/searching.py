@@ -4,8 +4,9 @@ Where no particle explains a measurement, all have the same likelihood: that of 
 sample size stays as it is, nothing is resampled, and nothing moves. In a search, climbs from draws of the
 prior lead to modes of the posterior given all measurements so far, and fresh particles are drawn about them,
 from a mixture with a wide component (defensive: Hesterberg, Technometrics 37, 1995). The old particles and
-the fresh ones are two estimates of the same posterior and of its evidence, and are joined by those. So the
-result does not depend on which modes the old particles happened to keep.
+the fresh ones are two estimates of the same posterior and of its evidence, and are pooled by those. So modes
+that the old particles lost come back. Of their shares that holds on average over runs: in one run half of the
+particles are drawn from the old ones, whichever modes these kept.
 """
 
 from __future__ import annotations

@@ -41,7 +41,7 @@ def branch_strata(strata: Strata, observed: Observed) -> tuple[Strata, dict[Stru
     """
     parts: list[tuple[Structure, Population]] = []
     log_likelihoods: dict[Structure, Tensor] = {}
-    for structure, population in strata.populations.items():
+    for population in strata.populations.values():
         trace = population.trace
         if isinstance(trace, SeriesTrace):
             raise InputError(
@@ -56,7 +56,7 @@ def branch_strata(strata: Strata, observed: Observed) -> tuple[Strata, dict[Stru
             given = {**observed.observations, **new.observations}
             longer, log_weight = extend(trace, observed.args, given)
             log_prior = longer.log_prob(*new) if new else torch.zeros(len(longer), dtype=torch.float64)
-            whole = structure.with_values(new)
+            whole = longer.structure
             log_weights = population.log_weights + log_prior
             parts.append((whole, replace(population, trace=longer, log_weights=log_weights)))
             # A particle whose structure is impossible has no weight, whatever it explains.

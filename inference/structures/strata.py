@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from bcppl.beliefs import Belief, effective_sample_size, normalised
+from bcppl.distributions.support import freedom_of
 from bcppl.errors import InputError, OtherKindError
 from bcppl.inference.population import FIELDS, Population
 from bcppl.inference.summaries import Probabilities
@@ -206,11 +207,13 @@ def probabilities(strata: Strata, address: str) -> Probabilities:
 
 
 def mean(strata: Strata, address: str) -> Tensor:
-    """The weighted mean (*event) over the particles of all structures: an average over models.
+    """The weighted mean (*event) over the particles of all structures, of poses the mean pose (7,).
 
     Raises:
         InputError: a structure does not visit the address, or the values' shapes differ.
     """
+    if freedom_of(next(iter(strata.populations.values())).trace.distributions[address]) is not None:
+        return strata.belief(address).mean
     weights = normalised(strata.log_weights)
     return torch.einsum("n,n...->...", weights, strata[address].to(torch.float64))
 

@@ -187,12 +187,6 @@ for make in (
     custom(Fault.DENSITY, make)
 
 
-@wrong(Fault.DENSITY, "factor")
-def of_torch() -> None:
-    factor = pyro.sample("factor", dist.LKJCholesky(3, number(2.0)))
-    normal("y", factor[..., 1, 0])
-
-
 # ---- gradients
 
 

@@ -74,9 +74,11 @@ class NormalPose(PoseDistribution):
         """By how much the angles of the rotations that are summed over differ, radians."""
         turns = sum(axis >= 3 for axis in self.freedom.axes)
         variances = self._scale.detach()[..., self.freedom.dimension - turns :, :].square().sum(dim=-1)
-        # Beyond half a radian the neighbouring windings carry more than 1e-16 of the mass.
-        wide = turns > 0 and float(variances.max().sqrt()) >= 0.5
-        return (0.0, -2.0 * math.pi, 2.0 * math.pi) if wide else (0.0,)
+        # Beyond half a radian the neighbouring windings carry more than 1e-16 of the mass: angles of up to
+        # 8.3 deviations count.
+        spread = float(variances.max().sqrt()) if turns > 0 else 0.0
+        most = max(1, math.ceil((8.3 * spread - math.pi) / (2.0 * math.pi))) if spread >= 0.5 else 0
+        return (0.0, *(sign * 2.0 * math.pi * k for k in range(1, most + 1) for sign in (-1.0, 1.0)))
 
     @cached_property
     def _half_log_determinant(self) -> Tensor:

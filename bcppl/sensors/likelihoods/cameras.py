@@ -83,6 +83,8 @@ class ClutteredCamera(CalibratedCamera):
         noise: further arguments of `RobustDepth`.
     """
 
+    nuisance_addresses = ("seen_by_*",)
+
     def __init__(
         self,
         recording: Recording,

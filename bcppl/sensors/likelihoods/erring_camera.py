@@ -80,6 +80,8 @@ class ErringCamera:
         InputError: a camera cannot see the part near its guess.
     """
 
+    nuisance_addresses = ("bias_*", "seen_by_*")
+
     def __init__(
         self,
         recording: Recording,
