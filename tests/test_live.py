@@ -19,6 +19,7 @@ from bcppl.arrays import Array
 from bcppl.errors import InferenceError, InputError
 from bcppl.inference import guided_smc
 from bcppl.inference.live import Filter, Sampler, play
+from bcppl.inference.live.waiting import Arrived, Waiting
 from bcppl.models import load_recording
 from bcppl.models.look_and_touch import model
 from bcppl.robot.motion import Probe
@@ -76,6 +77,22 @@ def test_a_window_waits_for_those_before_it(touched: Recording) -> None:
         assert live.settle().taken == 2
 
 
+def test_windows_that_arrive_twice_are_assimilated_once(touched: Recording) -> None:
+    one, two, three, _ = touched.measurements[:4]
+    joined = Measurement(ProbeWindow(one.action.probe, 0, 50), joined_touch(touched))
+    waiting = Waiting()
+    for each in (two, one, one, joined, two, three, three):
+        waiting.add(each, 0.0)
+    assert spans([waiting.take(join=False)]) == [(0, 25)]
+    assert spans([waiting.take(join=True)]) == [(25, 75)]
+    waiting.add(two, 0.0)
+    assert waiting.take(join=True) is None and len(waiting) == 0
+
+
+def spans(arrived: list[Arrived | None]) -> list[tuple[int, int]]:
+    return [(each.measurement.action.first, each.measurement.action.last) for each in arrived if each]
+
+
 def test_updates_that_are_late_join_windows_then_halve_particles_and_lose_nothing(touched: Recording) -> None:
     first = touched.measurements[0]
     with Filter(model, replace(touched, measurements=[]), particles=2 * FEW, deadline=1e-6) as live:
@@ -124,6 +141,28 @@ def test_a_measurement_that_nothing_explains_is_left_out_or_ends_it(touched: Rec
     assert any("left out" in str(each.message) for each in caught)
 
 
+def test_windows_after_one_that_is_left_out_or_overlaps_are_left_out(touched: Recording) -> None:
+    def faulty_at_first(model: Any, recording: Recording, **settings: Any) -> Iterator[Any]:
+        if recording.measurements and recording.measurements[-1].action.first == 0:
+            raise InferenceError("no particle has any weight")
+        yield from guided_smc.infer(model, recording, **settings)
+
+    one, two, three, _ = touched.measurements[:4]
+    joined = Measurement(ProbeWindow(one.action.probe, 0, 50), joined_touch(touched))
+    empty = replace(touched, measurements=[])
+    with Filter(model, empty, particles=FEW, infer=faulty_at_first, deadline=1e3) as live:
+        for each in (one, two, three):
+            live.observe(each.action, each.observation)
+        with pytest.warns(RuntimeWarning, match="leaves out stamps 0 to .*begin another probe: it is left"):
+            assert live.settle().taken == 0
+    assert [bool(update.fault) for update in live.updates] == [True] * 3
+    with Filter(model, empty, particles=FEW, deadline=1e3) as live:
+        for each in (one, joined):
+            live.observe(each.action, each.observation)
+        with pytest.warns(RuntimeWarning, match="begins before an earlier window ended, at 25"):
+            assert live.settle().taken == 1
+
+
 def test_an_error_of_a_callback_ends_the_filter_and_is_seen(touched: Recording) -> None:
     def broken(step: Any, update: Any) -> None:
         raise KeyError("of the callback")
@@ -135,10 +174,44 @@ def test_an_error_of_a_callback_ends_the_filter_and_is_seen(touched: Recording) 
             live.settle()
         with pytest.raises(KeyError, match="of the callback"):
             live.observe(second.action, second.observation)
+        for asked in (live.next_probe, live.insertion):
+            with pytest.raises(KeyError, match="of the callback"):
+                asked(timeout=5.0)
     with Filter(model, replace(touched, measurements=[]), particles=FEW) as live:
         pass
     with pytest.raises(InputError, match="the live filter is closed"):
         live.observe(first.action, first.observation)
+
+
+def test_a_callback_may_ask_and_not_wait(touched: Recording) -> None:
+    asked: list[Any] = []
+
+    def asks(step: Any, update: Any) -> None:
+        with pytest.raises(InputError, match="settle in another thread"):
+            live.settle(timeout=0.1)
+        asked.append(live._run(lambda: live.belief, 0.1))
+
+    with Filter(model, replace(touched, measurements=[]), particles=FEW, on_update=asks) as live:
+        live.observe(touched.measurements[0].action, touched.measurements[0].observation)
+        assert asked == [live.settle().belief]
+
+
+def test_requests_hold_up_no_measurement_and_are_dropped_when_nobody_waits(touched: Recording) -> None:
+    done: list[str] = []
+    listed = {"particles": FEW, "on_update": lambda *_: done.append("update")}
+    with Filter(model, replace(touched, measurements=[]), **listed) as live:
+        held = threading.Event()
+        live._thread.submit(held.wait)
+        with pytest.raises(TimeoutError):
+            live._run(lambda: done.append("given up"), 0.01)
+        asking = threading.Thread(target=lambda: live._run(lambda: done.append("request"), None))
+        asking.start()
+        asking.join(0.1)
+        live.observe(touched.measurements[0].action, touched.measurements[0].observation)
+        held.set()
+        asking.join()
+        live.settle()
+    assert done == ["update", "request"]
 
 
 def test_a_camera_of_the_name_of_another_is_refused(touched: Recording) -> None:

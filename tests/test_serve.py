@@ -56,6 +56,28 @@ def serving(session: Any) -> Iterator[Server]:
         assert not thread.is_alive()
 
 
+def test_a_client_that_has_waited_too_long_asks_no_more() -> None:
+    released = threading.Event()
+
+    class Slow(Echo):
+        def answer(self, request: Mapping[str, Any]) -> dict[str, Any]:
+            released.wait(10.0)
+            return super().answer(request)
+
+    with serving(Slow()) as served, Client(*served.address, "secret") as client:
+        client._socket.settimeout(0.05)
+        with pytest.raises(InputError, match="does not answer"):
+            client.ask("one")
+        released.set()
+        with pytest.raises(InputError, match="the connection is closed"):
+            client.ask("two")
+
+
+def test_an_empty_token_is_refused() -> None:
+    with pytest.raises(InputError, match="the token is empty"):
+        Server(Session.__new__(Session), token="")
+
+
 def answer_of(raw: socket.socket) -> dict[str, Any]:
     raw.settimeout(5.0)
     data = b""
@@ -168,6 +190,8 @@ def test_samples_that_are_sent_give_the_belief_of_their_windows(session: Session
         ({"ask": "begin", "name": "p", "begin": 0.0, "rate": 1e9, "seconds": 1.0}, "stamps a second"),
         ({"ask": "begin", "name": "p", "begin": 0.0, "rate": 1e4, "seconds": 500.0}, "5000000 stamps"),
         ({"ask": "view", "camera": {}, "depth": [1.0]}, "the camera lacks 'name'"),
+        ({"ask": "samples", "wrench": np.zeros((7, 130))}, "wrench has shape (7, 130); send (K, 7)"),
+        ({"ask": "begin", "name": "p", "begin": 1.7e18, "rate": 1e2, "seconds": 1.0}, "begins at 1.7e+18 s"),
     ],
 )
 def test_what_is_wrong_is_answered_in_a_sentence(
@@ -187,6 +211,34 @@ def test_a_probe_that_is_not_over_keeps_its_samples_and_its_name(session: Sessio
     assert session._sampler is not None and not session._sampler._streams["wrench"].times
     assert session.answer({"ask": "end"})["windows"] == 0
     assert "there was a probe called 'first'" in session.answer(probe)["error"]
+
+
+def test_a_window_that_is_refused_drops_no_row_after_it(
+    session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(*_: object) -> None:
+        raise InputError("no.")
+
+    monkeypatch.setattr(session.live, "observe", refused)
+    session.answer({"ask": "begin", "name": "first", "begin": 0.0, "rate": 100.0, "seconds": 1.0})
+    stamps = np.arange(-0.1, 1.2, 0.01)
+    pose = np.tile([0.5, 0.0, 0.3, 1.0, 0.0, 0.0, 0.0], (len(stamps), 1))
+    wrench = np.column_stack([stamps, np.zeros((len(stamps), 6))])
+    request = {"ask": "samples", "wrench": wrench, "pose": np.column_stack([stamps, pose])}
+    assert session.answer(request) == {"error": "no."}
+    assert session._sampler is not None and session._sampler._streams["pose"].times[-1] == stamps[-1]
+
+
+def test_an_error_of_the_program_is_an_answer_and_is_logged(
+    session: Session, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def broken(_: object) -> Any:
+        raise KeyError("of\nthe program")
+
+    monkeypatch.setitem(session._asked, "belief", broken)
+    error = session.answer({"ask": "belief"})["error"]
+    assert error.startswith("belief has failed in the server") and "\n" not in error
+    assert "in broken" in caplog.text
 
 
 json_like = st.recursive(

@@ -114,9 +114,13 @@ class ProbeSensor:
         return bool(window.first <= (0 if newest is None else newest.last))
 
     def joined(self, first: Measurement, second: Measurement) -> Measurement | None:
-        """Two windows of a probe as one, by the later one's command."""
+        """Two windows of a probe as one, by the later one's command; the first if the other adds nothing."""
         one, other = first.action, second.action
-        if one.probe.name != other.probe.name or one.last != other.first:
+        if one.probe.name != other.probe.name:
+            return None
+        if other.last <= one.last:
+            return first
+        if other.first != one.last:
             return None
         fields = ("times", "wrench", "world_from_peg")
         both = [[getattr(m.observation, name) for m in (first, second)] for name in fields]

@@ -44,6 +44,9 @@ class Client:
     def ask(self, what: str, **given: Any) -> dict[str, Any]:
         """The answer to a request (`bcppl.inference.live.session`).
 
+        Where it does not come whole and in time, the connection is closed: what came later would be taken for
+        the answer to the next request.
+
         Raises:
             InputError: the server answers with an error, or no more.
         """
@@ -60,11 +63,18 @@ class Client:
         self.close()
 
     def _asked(self, message: dict[str, Any]) -> dict[str, Any]:
+        if self._socket.fileno() < 0:
+            raise InputError("the connection is closed, as after a request without an answer; connect again.")
+        request = packed(message)
         try:
-            self._socket.sendall(packed(message))
+            self._socket.sendall(request)
             answer = unpacked(self._read(length_of(self._read(LENGTH.size))))
         except OSError as error:
+            self.close()
             raise InputError(f"the server does not answer ({error}); connect again.") from error
+        except BaseException:
+            self.close()
+            raise
         if "error" in answer:
             raise InputError(str(answer["error"]))
         return answer

@@ -14,8 +14,7 @@ import time
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Literal, TypeVar
 
 from bcppl.arguments import number_within, whole_number
@@ -24,44 +23,25 @@ from bcppl.errors import InferenceError, InputError
 from bcppl.inference.design.ranking import Ranking
 from bcppl.inference.design.rules import AcquisitionRule, by_linearised_gain
 from bcppl.inference.filters.default import default_inference
-from bcppl.inference.filters.smc import Step, own_state
+from bcppl.inference.filters.smc import Step
+from bcppl.inference.live.refusing import refuse, refuse_part
 from bcppl.inference.live.showing import COLUMNS, show, show_earlier
+from bcppl.inference.live.updates import UpdateInfo, affordable, resized
 from bcppl.inference.live.waiting import Waiting
+from bcppl.inference.live.worker import Worker
 from bcppl.inference.planning.candidate_layout import plan_candidates, require_uncertain
 from bcppl.inference.planning.constraints import Candidates, require_candidates
 from bcppl.inference.planning.insertion import InsertionParameters, insertion_plan
-from bcppl.inference.sizing import resize
 from bcppl.robot.arm_with_peg import ArmWithPeg
 from bcppl.robot.plan import InsertionPlan
-from bcppl.sensors import Measurement, Recording, checks
+from bcppl.sensors import Measurement, Recording
 from bcppl.sensors.candidates import Candidate, with_candidates
-from bcppl.sensors.layout import link
-from bcppl.sensors.protocol import InParts, sensor_for
 from bcppl.traces import Model
 from bcppl.viewer.live import LivePage
 
-FEWEST = 20  # particles, that no deadline takes
 KEPT = 1000  # updates
-AHEAD = 0.5  # of the deadline: a faster update may have more particles
 
 T = TypeVar("T")
-
-
-@dataclass(frozen=True, eq=False)
-class UpdateInfo:
-    """What one update of a live belief did.
-
-    Attributes:
-        joined: how many measurements it assimilated as one.
-        particles: how many it was made with.
-        seconds: from the arrival of the last of them until the belief had it.
-        fault: why they are left out; empty where they are not.
-    """
-
-    joined: int
-    particles: int
-    seconds: float
-    fault: str = ""
 
 
 class Filter:
@@ -80,8 +60,10 @@ class Filter:
         seed: same seed, same belief, if no update is late.
         deadline: seconds within which a measurement is to be assimilated.
         on_fault: whether a measurement that no particle explains, whose likelihood is no number, or whose
-            kind the model does not explain is left out with a warning ("skip") or ends the filter ("stop").
-        on_update: called in the filter's thread with the step and what the update did, after each.
+            kind the model does not explain is left out with a warning ("skip"), and so are the windows after
+            it in its probe, or ends the filter ("stop").
+        on_update: called in the filter's thread with the step and what the update did, after each; it may
+            rank and plan, and must not `settle`.
 
     Raises:
         InputError: the recording has a problem, or a number is out of range.
@@ -113,7 +95,7 @@ class Filter:
         self._pages: list[LivePage] = []
         self._shared: dict[str, dict[str, Any]] = {}  # by kind and name, such as cameras
         self._failed: BaseException | None = None
-        self._thread = ThreadPoolExecutor(1, "bcppl live")
+        self._thread = Worker()
         try:
             self._step = self._thread.submit(self._begin).result()
             for measurement in recording.measurements:
@@ -135,11 +117,11 @@ class Filter:
             Exception: `on_update` has raised it, which ends the filter.
         """
         measurement = Measurement(action, observation)
-        self._refuse(measurement)
+        refuse(measurement, self._recording, self._shared)
         with self._changed:
             self._raise_failure()
             self._waiting.add(measurement, time.monotonic())
-        self._submit(self._assimilate)
+        self._thread.submit(self._assimilate)
 
     # ---- what is known
 
@@ -178,12 +160,14 @@ class Filter:
         Raises:
             TimeoutError: it takes longer.
             InferenceError: a measurement has ended the filter.
+            InputError: it is called within `on_update`, which runs in the thread that is waited for.
 
         Warns:
             RuntimeWarning: windows wait for earlier ones that have not come.
         """
+        if self._thread.inside:
+            raise InputError("on_update waits for the filter's thread, its own; settle in another thread.")
         self._run(lambda: None, timeout)
-        self._raise_failure()
         if held := self._waiting.held_back():
             warnings.warn(
                 f"{len(held)} measurements wait for earlier ones of the same probe, the first of them "
@@ -210,6 +194,7 @@ class Filter:
 
         Raises:
             InputError: no candidate is left, or the belief has collapsed.
+            InferenceError: a measurement has ended the filter.
         """
 
         def ranked() -> Ranking:
@@ -236,6 +221,7 @@ class Filter:
 
         Raises:
             InputError: there is no peg, the part has no hole or several, or the peg does not fit.
+            InferenceError: a measurement has ended the filter.
         """
         peg = self._recording.peg
         if peg is None:
@@ -252,6 +238,9 @@ class Filter:
         Args:
             title: of the page.
             arm: that holds the peg; it is drawn where the peg was measured.
+
+        Raises:
+            InferenceError: a measurement has ended the filter.
         """
         page = LivePage(self._recording, title, COLUMNS, arm)
 
@@ -260,12 +249,16 @@ class Filter:
             show(page, self._step, self._recording)
             self._pages.append(page)
 
-        self._run(begin, None)
+        try:
+            self._run(begin, None)
+        except BaseException:
+            page.close()
+            raise
         return page
 
     def close(self) -> None:
         """End the filter's thread, and its pages; what waits is not assimilated."""
-        self._thread.shutdown(wait=True, cancel_futures=True)
+        self._thread.close()
         for page in self._pages:
             page.close()
 
@@ -298,10 +291,13 @@ class Filter:
                 self._failed = error
 
     def _update(self, measurement: Measurement, arrived: float, joined: int) -> None:
-        before, count = self._step, self._affordable(joined)
+        before = self._step
+        last = self._updates[-1] if self._updates else None
+        count = affordable(last, joined, self.particles, self.deadline)
         recording = replace(self._recording, measurements=[*self._recording.measurements, measurement])
         fault = ""
         try:
+            refuse_part(recording)
             start = resized(before, count)
             scene = self.model.prepare(recording)
             options = {"particles": count, "seed": self.seed, "scene": scene, "start": start}
@@ -322,51 +318,19 @@ class Filter:
         if self._on_update is not None:
             self._on_update(self._step, update)
 
-    def _affordable(self, joined: int) -> int:
-        """How many particles the next update is made with, by how long the last one took."""
-        last = self._updates[-1] if self._updates else None
-        if last is None:
-            return self.particles
-        if last.seconds > 2.0 * self.deadline and last.joined > 1 and joined > 1:
-            return max(min(FEWEST, self.particles), last.particles // 2)
-        if last.seconds < AHEAD * self.deadline:
-            return min(self.particles, 2 * last.particles)
-        return last.particles
-
     def _run(self, what: Callable[[], T], timeout: float | None) -> T:
-        return self._submit(what).result(timeout)
+        """What is asked for, after all measurements that wait; within `on_update`, at once."""
 
-    def _submit(self, what: Callable[[], T]) -> Future[T]:
-        try:
-            return self._thread.submit(what)
-        except RuntimeError as error:
-            raise InputError("the live filter is closed; begin another with its recording.") from error
+        def asked() -> T:
+            self._raise_failure()
+            return what()
+
+        def after_measurements() -> T:
+            self._assimilate()  # those as well that have arrived since the request: no request is before them
+            return asked()
+
+        return asked() if self._thread.inside else self._thread.run(after_measurements, timeout)
 
     def _raise_failure(self) -> None:
         if self._failed is not None:
             raise self._failed
-
-    def _refuse(self, measurement: Measurement) -> None:
-        """Refuse a measurement that is wrong by itself."""
-        sensor = sensor_for(measurement)
-        alone = sensor.alone(measurement) if isinstance(sensor, InParts) else measurement
-        number = len(self._recording.measurements)
-        for _, problem in sensor.problems([(number, alone)], self._recording):
-            raise InputError(problem)
-        for name, kept in sensor.action.fields.items():
-            if kept.group:
-                thing = getattr(measurement.action, name)
-                link(thing.name)  # refuses an empty one
-                known = self._shared.setdefault(kept.group, {})
-                for problem in checks.named_alike(f"measurement {number}", kept.group, thing, known):
-                    raise InputError(problem)
-
-
-def resized(step: Step, count: int) -> Step:
-    """A step with another number of particles, drawn by its own random state."""
-    if len(step.population) == count:
-        return step
-    state = [step.random_state]
-    with own_state(state, count):
-        population = resize(step.population, count)
-    return replace(step, population=population, random_state=state[0])

@@ -30,11 +30,18 @@ class Server:
 
     Attributes:
         address: host and port, once it listens.
+
+    Raises:
+        InputError: the token is empty.
     """
 
     def __init__(
         self, session: Session, host: str = "127.0.0.1", port: int = 0, token: str | None = None
     ) -> None:
+        if token == "":
+            raise InputError(
+                "the token is empty, which anybody guesses; give another, or none for a new one."
+            )
         self.session, self.host, self.port = session, host, port
         self.token = secrets.token_urlsafe(16) if token is None else token
         self.address: tuple[str, int] = (host, port)

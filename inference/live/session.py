@@ -9,12 +9,13 @@
     {"ask": "next_probe"}              {"plan": {...}, "gain": nats}
     {"ask": "insertion"}               {"search": {...}, "push": {...}}
 
-An answer has "error", one sentence, where something is wrong; of samples, what was complete before the
-fault is assimilated.
+An answer has "error", one sentence, where something is wrong; of samples, all rows that are right are kept,
+and what is complete with them is assimilated. An error of the program itself is logged with its traceback.
 """
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -24,18 +25,20 @@ import numpy as np
 from bcppl import poses
 from bcppl.arguments import number_within
 from bcppl.arrays import Array
-from bcppl.errors import InferenceError, InputError
+from bcppl.errors import InferenceError, InputError, reason_of
 from bcppl.inference.live.filter import Filter
 from bcppl.inference.live.sampler import Sampler
 from bcppl.robot.motion import Probe
 from bcppl.robot.plan import LONGEST, QUICKEST, probe_of
-from bcppl.sensors import DepthImage, Measurement
+from bcppl.sensors import DepthImage, Measurement, checks
 from bcppl.sensors.candidates import planner_of
 from bcppl.sensors.layout import Layout
 from bcppl.sensors.protocol import Plannable, sensor_named
 
 MOST_STAMPS = 100_000  # of a probe
 WAITS = 60.0  # s for a ranking or a plan
+LATEST = 2.0**32  # s: beyond it a float cannot tell stamps a microsecond apart
+LOG = logging.getLogger(__name__)
 
 Answer = dict[str, Any]
 
@@ -72,6 +75,9 @@ class Session:
             return {
                 "error": f"{asked} takes longer than {WAITS:g} s; ask again when fewer measurements wait."
             }
+        except Exception as error:  # a client has an answer to each request, whatever happens here
+            LOG.exception("%s has failed", asked)
+            return {"error": f"{asked} has failed in the server ({reason_of(error)}); see its log."}
 
     def _begin(self, request: Mapping[str, Any]) -> Answer:
         if "plan" in request:
@@ -80,6 +86,8 @@ class Session:
             probe = _unknown(request)
         if len(probe.stamps) > MOST_STAMPS:
             raise InputError(f"the probe has {len(probe.stamps)} stamps; give {MOST_STAMPS} at most.")
+        for problem in checks.times(f"the probe {probe.name[:40]!r}", probe.stamps):
+            raise InputError(problem)
         with self._lock:
             if self._sampler is not None:
                 under_way = self._sampler.probe.name[:40]
@@ -94,11 +102,17 @@ class Session:
         rows = {name: _rows(request, name, width) for name, width in (("wrench", 7), ("pose", 8))}
         poses.as_pose(rows["pose"][:, 1:], "a sample's pose")
         count = 0
+        refused: list[InputError] = []
         with self._lock:
             sampler = self._begun()
             for name, add in (("wrench", sampler.wrench), ("pose", sampler.pose)):
                 for row in rows[name]:
-                    count += self._observe(add(float(row[0]), row[1:]))
+                    try:
+                        count += self._observe(add(float(row[0]), row[1:]))
+                    except InputError as error:  # the rows after it are right, and are not sent again
+                        refused.append(error)
+        if refused:
+            raise refused[0]
         return {"windows": count, "behind": self.live.behind}
 
     def _end(self, _: Mapping[str, Any]) -> Answer:
@@ -172,7 +186,8 @@ def _read(layout: Layout[Any], tree: Any, what: str) -> Any:
 
 def _unknown(request: Mapping[str, Any]) -> Probe:
     """A probe of which only the time is known: its command is taken to stand still."""
-    name, begin = request.get("name"), number_within("a probe begins at {} s", request.get("begin"))
+    name, given = request.get("name"), request.get("begin")
+    begin = number_within("a probe begins at {} s", given, least=-LATEST, most=LATEST)
     rate = number_within("a probe has {} stamps a second", request.get("rate"), least=1.0, most=QUICKEST)
     seconds = number_within("a probe lasts {} s", request.get("seconds"), least=1.0 / rate, most=LONGEST)
     if not isinstance(name, str) or not name:
@@ -185,9 +200,11 @@ def _unknown(request: Mapping[str, Any]) -> Probe:
 def _rows(request: Mapping[str, Any], name: str, width: int) -> Array:
     given = request.get(name, [])
     try:
-        rows = np.asarray(given, dtype=np.float64).reshape(-1, width) if len(given) else np.empty((0, width))
-    except (TypeError, ValueError) as error:
+        rows = np.asarray(given, dtype=np.float64) if len(given) else np.empty((0, width))
+    except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{name} is no list of rows of {width} numbers, the first the stamp.") from error
+    if rows.ndim != 2 or rows.shape[1] != width:
+        raise InputError(f"{name} has shape {rows.shape}; send (K, {width}), the first column the stamps.")
     if not np.isfinite(rows).all():
         raise InputError(f"{name} has a row with a number that is not finite; leave it out.")
     return rows

@@ -9,7 +9,7 @@ from bcppl.sensors import Recording
 from bcppl.viewer.live import LivePage
 
 if TYPE_CHECKING:
-    from bcppl.inference.live.filter import UpdateInfo
+    from bcppl.inference.live.updates import UpdateInfo
 
 COLUMNS = ("measurement", "particles", "joined", "late s", "log Z")
 

@@ -20,7 +20,8 @@ class Waiting:
     """Measurements that were made and are not yet assimilated.
 
     What comes in parts, such as the windows of a probe, leaves in the order of the parts, in whatever order
-    they arrive; everything else in the order of arrival.
+    they arrive, and a part that adds nothing to those before it is dropped; everything else leaves in the
+    order of arrival.
     """
 
     def __init__(self) -> None:
@@ -32,7 +33,8 @@ class Waiting:
 
     def add(self, measurement: Measurement, time: float) -> None:
         """One more, that arrived at a time."""
-        self._waiting.append(Arrived(measurement, time))
+        if not any(_holds(left, measurement) for left in self._left):
+            self._waiting.append(Arrived(measurement, time))
 
     def held_back(self) -> list[Measurement]:
         """Those that wait for an earlier part."""
@@ -56,13 +58,15 @@ class Waiting:
                 continue
             whole = each
             if before is not None:
-                sensor = sensor_of(each.measurement.action)
-                pair = before.measurement, each.measurement
-                both = sensor.joined(*pair) if isinstance(sensor, InParts) else None
+                both = _joined(before.measurement, each.measurement)
                 if both is None:
                     return None
                 whole = Arrived(both, each.time, before.joined + each.joined)
-            self._waiting.remove(each)
+            self._waiting = [
+                other
+                for other in self._waiting
+                if other is not each and not _holds(each.measurement, other.measurement)
+            ]
             self._left.append(each.measurement)
             return whole
         return None
@@ -70,3 +74,15 @@ class Waiting:
     def _follows(self, measurement: Measurement) -> bool:
         sensor = sensor_of(measurement.action)
         return not isinstance(sensor, InParts) or sensor.follows(measurement, self._left)
+
+
+def _joined(first: Measurement, second: Measurement) -> Measurement | None:
+    sensor = sensor_of(second.action)
+    if isinstance(sensor, InParts) and sensor_of(first.action) is sensor:
+        return sensor.joined(first, second)
+    return None
+
+
+def _holds(first: Measurement, second: Measurement) -> bool:
+    """Whether a part adds nothing to another one."""
+    return _joined(first, second) is first
