@@ -65,7 +65,9 @@ def read_mesh(path: Path, process: bool = False) -> trimesh.Trimesh:
         if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
             raise ValueError("a face has no vertices")
     except Exception as error:  # every format has its own reader with its own errors
-        reason = reason_of(error)
+        # Of what it cannot read, trimesh guesses the encoding with a package that few have.
+        guessed = isinstance(error, ImportError) and suffix != ".dae"
+        reason = "it is damaged" if guessed else reason_of(error)
         raise InputError(
             f"mesh file {path} cannot be read ({reason}); export it again as OBJ or STL."
         ) from error

@@ -116,7 +116,8 @@ class Part:
         """Refuse a mesh that cannot be rendered or used in contact.
 
         Raises:
-            InputError: the mesh is empty, not finite, larger than 5 m, or (with `closed`) open or inside out.
+            InputError: the mesh is empty, not finite, larger than 5 m, or (with `closed`) open, wound both
+                ways, or a body of it is inside out and no cavity of another.
         """
         if len(self.faces) == 0 or len(self.vertices) == 0:
             raise InputError(f"part {self.name!r} has an empty mesh; export it again with its triangles.")
@@ -130,27 +131,67 @@ class Part:
             )
         if not closed:
             return
-        if not self.is_closed:
+        open_edges, turned_edges = self._wrong_edges
+        if open_edges:
             raise InputError(
-                f"part {self.name!r} has an open mesh ({self._open_edges} open edges); close or merge it."
+                f"part {self.name!r} has an open mesh ({open_edges} open edges); close or merge it."
             )
-        first, second, third = np.moveaxis(self.vertices[self.faces], 1, 0)
-        volume = float((first * np.cross(second, third)).sum()) / 6.0
-        if volume < -1e-9 * self.extent.max() ** 3:
+        if turned_edges:
             raise InputError(
-                f"part {self.name!r} is inside out ({volume:.3g} m^3); turn its faces with faces[:, ::-1]."
+                f"part {self.name!r} has faces wound both ways ({turned_edges} edges between them); turn "
+                "them all outwards, as trimesh.repair.fix_normals does."
             )
+        self._refuse_inside_out()
 
     @property
     def is_closed(self) -> bool:
-        """Whether every edge of the mesh is shared by exactly two faces."""
-        return self._open_edges == 0
+        """Whether every edge is shared by exactly two faces, which run along it in opposite directions."""
+        return self._wrong_edges == (0, 0)
 
     @cached_property
-    def _open_edges(self) -> int:
-        low, high = np.sort(self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)).astype(np.int64).T
-        _, shared = np.unique(low * len(self.vertices) + high, return_counts=True)
-        return int((shared != 2).sum())
+    def _wrong_edges(self) -> tuple[int, int]:
+        """How many edges are not shared by exactly two faces, and along how many both run the same way."""
+        first, second = self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64).T
+        edges = np.minimum(first, second) * len(self.vertices) + np.maximum(first, second)
+        _, edge, shared = np.unique(edges, return_inverse=True, return_counts=True)
+        upwards = np.bincount(edge, weights=first < second)
+        return int((shared != 2).sum()), int(((shared == 2) & (upwards != 1)).sum())
+
+    def _refuse_inside_out(self) -> None:
+        """Refuse a body of a closed mesh that is inside out, unless it is a cavity of the others."""
+        body = _bodies(self.faces)
+        corners = self.vertices[self.faces] - self.vertices.mean(axis=0)
+        volumes = np.bincount(body, weights=np.linalg.det(corners)) / 6.0
+        for k in np.flatnonzero(volumes < -1e-9 * self.extent.max() ** 3):
+            place = corners[body == k][0].mean(axis=0)
+            if _winding(corners[body != k] - place) < 0.5:
+                words = "is" if len(volumes) == 1 else f"has a body of {np.sum(body == k)} faces that is"
+                raise InputError(
+                    f"part {self.name!r} {words} inside out ({volumes[k]:.3g} m^3); turn its faces with "
+                    "faces[:, ::-1]."
+                )
+
+
+def _bodies(faces: Indices) -> Indices:
+    """The body (F,) of each face of a closed mesh: faces that share edges are of one."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    low, high = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)).T
+    one, other = (np.lexsort((low, high)) // 3).reshape(-1, 2).T
+    _, body = connected_components(
+        coo_array((np.ones(len(one)), (one, other)), shape=(len(faces), len(faces))), directed=False
+    )
+    return np.asarray(body)
+
+
+def _winding(corners: Array) -> float:
+    """How often triangles (F, 3, 3) go round the origin: 1 inside a closed mesh, 0 outside."""
+    first, second, third = np.moveaxis(corners, 1, 0)
+    one, two, three = np.moveaxis(np.linalg.norm(corners, axis=2), 1, 0)
+    across = (first * second).sum(1) * three + (second * third).sum(1) * one + (third * first).sum(1) * two
+    # Van Oosterom and Strackee's solid angles, "The solid angle of a plane triangle", 1983.
+    return float(np.arctan2(np.linalg.det(corners), one * two * three + across).sum() / (2.0 * np.pi))
 
 
 def with_tip_at(peg: Part, world_from_peg: Tensor, place: Tensor) -> Tensor:

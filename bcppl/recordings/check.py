@@ -52,7 +52,10 @@ def notes(recording: Recording) -> list[str]:
 def _notes(recording: Recording) -> Iterator[str]:
     part = recording.part
     if not (_touched(recording) or list(checks.part(part, closed=False)) or part.is_closed):
-        yield f"part {part.name!r} has an open mesh: it can be looked at, as here, but not touched."
+        yield (
+            f"part {part.name!r} has an open mesh, or faces wound both ways: it can be looked at, as here, "
+            "but not touched."
+        )
     known = _installed_models()
     if recording.model not in known:
         close = get_close_matches(recording.model, known, 1)

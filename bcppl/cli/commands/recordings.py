@@ -50,7 +50,7 @@ def check(
     console = Console(stderr=as_json)
     table = Table(show_header=False, box=None, pad_edge=False)
     for what, value in described:
-        table.add_row(f"[bold]{what}[/bold]", escape(visible(value)))
+        table.add_row(f"[bold]{escape(visible(what))}[/bold]", escape(visible(value)))
     console.print(table)
     for word, colour, lines in (
         ("note", "yellow", remarks), ("doubt", "yellow", doubted), ("wrong", "red", wrong),
@@ -101,10 +101,19 @@ def _write(recording: Recording, out: Path) -> None:
     from bcppl.recordings import describe, save, validate
 
     validate(recording)
-    refuse_overwriting("--out", out)
+    _refuse_out(out)
     save(recording, out)
     written = f"wrote {out}: {dict(describe(recording))['measurements']}"
     Console().print(visible(written), highlight=False, markup=False)
+
+
+def _refuse_out(out: Path, *read: Path) -> None:
+    """Refuse to write a recording over what is read, or over what is none, such as a log."""
+    import h5py
+
+    refuse_overwriting("--out", out, *read)
+    if out.is_file() and out.stat().st_size and not h5py.is_hdf5(out):
+        raise InputError(f"--out would overwrite {out}, which is no recording; give another name.")
 
 
 class Importers(TyperGroup):
@@ -146,7 +155,7 @@ def _importing(command: Callable[..., Recording | Imported]) -> Callable[..., No
 
         from bcppl.recordings.importers import Imported
 
-        refuse_overwriting("--out", out, *(each for each in options.values() if isinstance(each, Path)))
+        _refuse_out(out, *(each for each in options.values() if isinstance(each, Path)))
         made = command(**options)
         imported = made if isinstance(made, Imported) else Imported(made)
         for line in imported.report:

@@ -10,7 +10,7 @@ import numpy as np
 
 from bcppl.arrays import Array
 from bcppl.errors import InputError
-from bcppl.recordings.importers.bag.reading import Bag, Message
+from bcppl.recordings.importers.bag.reading import Bag, Message, stamped
 from bcppl.recordings.importers.bag.rows import unstamped_words
 from bcppl.recordings.importers.bench.configuration.camera_fields import CameraFields, ImageFields
 from bcppl.recordings.importers.bench.configuration.field_types import Length, factor
@@ -106,25 +106,36 @@ class Images:
 
 
 class Intrinsics:
-    """The first message of a camera's information."""
+    """The first message of a camera's information, and when another differed from it."""
 
     def __init__(self) -> None:
         self._first: Any = None
+        self._changed: float | None = None  # the stamp, s
 
     def add(self, bag: Bag, message: Message) -> None:
-        """Keep the first."""
+        """Keep the first, and the stamp of one that states something else."""
+        info = bag.parsed(message)
         if self._first is None:
-            self._first = bag.parsed(message)
+            self._first = info
+        elif self._changed is None and _stated(info) != _stated(self._first):
+            self._changed = stamped(info.header, message.received)[0]
 
     def of(self, name: str, fields: CameraFields) -> CameraFields:
         """The fields with the intrinsics that the message states.
 
         Raises:
-            InputError: it states none, binning or a part of the image, or another model of a lens.
+            InputError: it states none, binning or a part of the image, or another model of a lens; or a later
+                message differs.
         """
         where = f"{fields.info}, which cameras.{name}.info names,"
         remedy = "state fx, fy, cx, cy and distortion in place of info"
-        return fields.model_copy(update=intrinsics_of(where, self._first, remedy))
+        if self._changed is not None:
+            raise InputError(
+                f"{where} states other intrinsics from {self._changed:.3f} s on; cut the bag there, or "
+                f"{remedy}."
+            )
+        rectified = "rect" in fields.topic.rpartition("/")[2]
+        return fields.model_copy(update=intrinsics_of(where, self._first, remedy, rectified))
 
     @property
     def size(self) -> tuple[int, int] | None:
@@ -133,29 +144,43 @@ class Intrinsics:
         return size if all(size) else None
 
 
-def intrinsics_of(where: str, info: Any, remedy: str) -> dict[str, Any]:
+def intrinsics_of(where: str, info: Any, remedy: str, rectified: bool = False) -> dict[str, Any]:
     """The focal lengths, principal point (pixels) and distortion that a CameraInfo states.
 
     Args:
         where: it is from, for messages.
         info: the message, of ROS 1 or ROS 2.
         remedy: what to do where it states none.
+        rectified: whether the images are: their lens is P, without distortion.
 
     Raises:
         InputError: it states none, binning or a part of the image, or another model of a lens.
     """
-    matrix = info.K if hasattr(info, "K") else info.k  # as ROS 1 and ROS 2 write it
-    lens = [float(each) for each in (info.D if hasattr(info, "D") else info.d)]
-    if not (np.isfinite(matrix).all() and matrix[0] > 0.0 and matrix[4] > 0.0):
-        raise InputError(f"{where} states no intrinsics (its K is not calibrated); {remedy}.")
+    lens = [] if rectified else _numbers(info, "d")
+    letter = "p" if rectified else "k"
+    matrix = np.reshape(_numbers(info, letter), (3, -1))
+    if not (np.isfinite(matrix).all() and matrix[0, 0] > 0.0 and matrix[1, 1] > 0.0):
+        raise InputError(f"{where} states no intrinsics (its {letter.upper()} is not calibrated); {remedy}.")
     window = info.roi
     if max(info.binning_x, info.binning_y) > 1 or window.x_offset or window.y_offset:
         raise InputError(f"{where} states binning or a part of the image; {remedy} of the image itself.")
     if any(lens) and (info.distortion_model not in _BROWN or any(lens[5:])):
         raise InputError(f"{where} has the lens model {info.distortion_model!r}; rectify, and {remedy}.")
-    stated = {"fx": matrix[0], "fy": matrix[4], "cx": matrix[2], "cy": matrix[5]}
+    stated = {"fx": matrix[0, 0], "fy": matrix[1, 1], "cx": matrix[0, 2], "cy": matrix[1, 2]}
     numbers = {key: float(value) for key, value in stated.items()}
     return {**numbers, "distortion": lens[:5] if any(lens) else []}
+
+
+def _numbers(info: Any, letter: str) -> list[float]:
+    """A matrix of a CameraInfo: ROS 1 writes its letter large, ROS 2 small."""
+    return [float(each) for each in getattr(info, letter if hasattr(info, letter) else letter.upper())]
+
+
+def _stated(info: Any) -> tuple[Any, ...]:
+    """What a CameraInfo states of its lens, to be compared."""
+    window = info.roi.x_offset, info.roi.y_offset
+    size = info.height, info.width, info.binning_x, info.binning_y, info.distortion_model, *window
+    return (*size, *(_numbers(info, letter) for letter in "dkp"))
 
 
 def encoded(message: Any) -> Length | None:

@@ -22,10 +22,16 @@ _BACK = [0, 1, 2, 4, 5, 6, 3]
 
 
 class _Edge:
-    """The transforms of one frame in another: stamps and poses, and how many stamps are zero."""
+    """The transforms of one frame in another: stamps and poses, and how many stamps are zero.
 
-    def __init__(self) -> None:
-        self.flat, self.unstamped, self.is_fixed = array("d"), 0, False
+    Args:
+        parent: the frame in which the other is.
+        child: the other.
+    """
+
+    def __init__(self, parent: str, child: str) -> None:
+        self.parent, self.child = parent, child
+        self.flat, self.unstamped, self.is_fixed, self.changes = array("d"), 0, False, False
 
     def table(self) -> Array:
         """Stamps, positions and quaternions x y z w (T, 8)."""
@@ -89,7 +95,8 @@ class Transforms:
         """Stamps and poses (T, 8), quaternions x y z w, at the stamps of the fastest transform on the way.
 
         Raises:
-            InputError: there is no way from one frame to the other, or no transform on it moves.
+            InputError: there is no way from one frame to the other, or there are two; on it no transform
+                moves, or a static one changes.
         """
         way = self._way()
         for edge, _ in way:
@@ -129,6 +136,11 @@ class Transforms:
                 f"{self._name}: {self._topic} has a transform without a rotation, with numbers "
                 f"{table[off][0, 1:].tolist()}; filter the bag, or give another topic."
             )
+        if edge.changes:
+            raise InputError(
+                f"{self._name}: the static transform from {edge.parent!r} to {edge.child!r} has other "
+                "numbers later in the bag; cut or filter the bag so that it is sent with one value."
+            )
 
     def _way(self) -> list[tuple[_Edge, bool]]:
         """The edges from parent to child, each with whether it leads from its parent to its child."""
@@ -143,30 +155,52 @@ class Transforms:
                 raise InputError(
                     f"{self._topic} has no frame {frame!r}, which {self._name}.{field} names; {meant}."
                 )
-        ways: dict[str, list[tuple[_Edge, bool]]] = {self._parent: []}
-        ahead = deque([self._parent])
-        while ahead:
-            frame = ahead.popleft()
-            for other, edge, forward in neighbours[frame]:
-                if other not in ways:
-                    ways[other] = [*ways[frame], (edge, forward)]
-                    ahead.append(other)
-        if self._child not in ways or not ways[self._child]:
+        way = _reached(neighbours, self._parent).get(self._child)
+        if not way:
             raise InputError(
                 f"{self._topic} has no transforms from {self._parent!r} to {self._child!r}; "
                 f"{self._name}.parent and child are two frames of one tree."
             )
-        return ways[self._child]
+        for edge, _ in way:
+            if other := _reached(neighbours, self._parent, without=edge).get(self._child):
+                raise InputError(
+                    f"{self._topic} has two ways from {self._parent!r} to {self._child!r}, {_spelled(way)} "
+                    f"and {_spelled(other)}; filter the bag so that each frame has one parent."
+                )
+        return way
+
+
+def _reached(
+    neighbours: dict[str, list[tuple[str, _Edge, bool]]], start: str, without: _Edge | None = None
+) -> dict[str, list[tuple[_Edge, bool]]]:
+    """The shortest way from a frame to each that is reached, but for those by one transform."""
+    ways: dict[str, list[tuple[_Edge, bool]]] = {start: []}
+    ahead = deque([start])
+    while ahead:
+        frame = ahead.popleft()
+        for other, edge, forward in neighbours[frame]:
+            if other not in ways and edge is not without:
+                ways[other] = [*ways[frame], (edge, forward)]
+                ahead.append(other)
+    return ways
+
+
+def _spelled(way: list[tuple[_Edge, bool]]) -> str:
+    frames = [edge.child if forward else edge.parent for edge, forward in way[:-1]]
+    return f"by {', '.join(map(repr, frames))}" if frames else "directly"
 
 
 def _keep(edges: dict[tuple[str, str], _Edge], bag: Bag, message: Message, fixed: bool) -> None:
     for each in bag.parsed(message).transforms:
         key = (each.header.frame_id.lstrip("/"), each.child_frame_id.lstrip("/"))
-        edge = edges.setdefault(key, _Edge())
-        if fixed:
-            edge.is_fixed = True
-            del edge.flat[:]
+        edge = edges.setdefault(key, _Edge(*key))
         at, turn = each.transform.translation, each.transform.rotation
+        numbers = (at.x, at.y, at.z, turn.x, turn.y, turn.z, turn.w)
+        before = edge.flat[-7:]
+        edge.is_fixed |= fixed
+        if edge.is_fixed:
+            edge.changes |= bool(before) and not np.allclose(before, numbers, rtol=0.0, atol=1e-9)
+            del edge.flat[:]
         stamp, unstamped = stamped(each.header, message.received)
         edge.unstamped += unstamped
-        edge.flat.extend((stamp, at.x, at.y, at.z, turn.x, turn.y, turn.z, turn.w))
+        edge.flat.extend((stamp, *numbers))

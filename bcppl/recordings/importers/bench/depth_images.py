@@ -15,6 +15,8 @@ from bcppl.recordings.image_files import opened
 from bcppl.recordings.importers.bench.configuration.camera_fields import CameraFields
 from bcppl.recordings.importers.bench.configuration.field_types import Length, factor
 
+_COLOURS = {2: "red, green and blue", 3: "a palette", 4: "grey and alpha", 6: "red, green, blue and alpha"}
+
 
 def read_depth(path: Path, fields: CameraFields) -> Array:
     """A depth image (H, W) in metres, NaN where missing; rounded to float32, as recordings keep it.
@@ -70,6 +72,7 @@ def _pixels(path: Path) -> Array:
             raise InputError(
                 f"{path} is no image ({one_line(error)}); export the depth again as 16 bit PNG."
             ) from error
+        _refuse_colours(path)
         if pixels.dtype == np.uint8:
             raise InputError(f"{path} has 8 bits, too few for a depth; export it as 16 bit PNG or .npy.")
     else:
@@ -77,6 +80,17 @@ def _pixels(path: Path) -> Array:
     if pixels.ndim != 2 or pixels.dtype.kind not in "iuf":
         raise InputError(f"{path} holds {pixels.dtype} of shape {pixels.shape}; give one channel of depth.")
     return np.asarray(pixels, dtype=np.float64)
+
+
+def _refuse_colours(path: Path) -> None:
+    """Refuse a PNG of several channels, of which Pillow reads 8 of 16 bits."""
+    with path.open("rb") as file:
+        header = file.read(26)
+    if header.startswith(b"\x89PNG") and (colours := _COLOURS.get(header[25])):
+        raise InputError(
+            f"{path} is a PNG of {header[24]} bits with {colours}; export its depth as "
+            "one channel of 16 bits."
+        )
 
 
 def _exr(path: Path) -> Any:
@@ -89,8 +103,16 @@ def _exr(path: Path) -> Any:
     try:
         with OpenEXR.File(str(path)) as file:
             channels = {name: np.asarray(channel.pixels) for name, channel in file.channels().items()}
+            data, shown = (
+                np.asarray(file.header()[f"{each}Window"]).tolist() for each in ("data", "display")
+            )
     except Exception as error:  # the library's own
         raise InputError(f"{path} cannot be read as EXR ({error}); save it again.") from error
+    if data != shown:
+        raise InputError(
+            f"{path} has pixels from {data[0]} to {data[1]} of an image from {shown[0]} to {shown[1]}; save "
+            "the whole image, for the intrinsics are of that."
+        )
     for name in ("Z", "Y", "R", "depth.Z"):
         if name in channels:
             return channels[name]

@@ -39,6 +39,7 @@ from bcppl.sensors import Measurement, Recording
 
 _LEAST_SHARED = 1.0  # s that wrench and pose share, or their clocks cannot be compared
 _ROWS = 20_000  # of which frames are changed at once
+_LONGEST_HOLE = 600.0  # s without a row: stamps every half millisecond of longer ones take gigabytes
 _FREE = 0.1  # s in free air with which a log begins
 
 
@@ -97,6 +98,8 @@ def _touches(
     start = float(frame.times[0])
     frame = frame.shifted(-start)
     wrench = read_wrench(felt_by, log, report).shifted(-start)
+    for stream in (frame, wrench):
+        _refuse_holes(stream)
     wrench = on_one_clock(wrench, *_motion(wrench, frame, mounting), fields.clock, report)
     stamps = common_stamps(frame, wrench, fields.cut.rate)
     if len(stamps) < 2:
@@ -110,6 +113,17 @@ def _touches(
     report += [words, f"common stamps: {len(stamps)} at {1.0 / step:.4g} Hz"]
     command = _command(fields, log, start, mounting.frame_from_peg, report)
     return probes(Rows(stamps, felt, world_from_peg, known), fields.cut, fields.arm, command, report)
+
+
+def _refuse_holes(stream: Stream) -> None:
+    """Refuse a stream whose clock was set forward, or that paused for long."""
+    steps = np.diff(stream.times)
+    longest = int(steps.argmax())
+    if steps[longest] > _LONGEST_HOLE:
+        raise InputError(
+            f"{stream.name} has no row for {steps[longest]:.6g} s, after {longest + 1} rows; cut the log "
+            "there, where its clock was set or the arm paused."
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,7 +23,8 @@ def stated_pose(name: str, fields: PoseFields) -> Array:
     """The pose (7,) of a field of the configuration.
 
     Raises:
-        InputError: its quaternion is not of unit length, or its matrix is no rotation.
+        InputError: its quaternion is not of unit length, its matrix is no rotation or column by column, or
+            its rotation vector is in degrees.
     """
     if fields.matrix is not None:
         rows = np.array([fields.matrix])
@@ -50,6 +51,8 @@ def read_poses(name: str, fields: PoseStreamFields, log: Log, report: list[str])
 def read_joints(fields: JointFields, log: Log, report: list[str]) -> Stream:
     """The stream of poses (T, 7) of a robot's tip, `base_from_frame`, by its forward kinematics.
 
+    Columns that bear the joints' names are the joints' in any order; others are in the order of the joints.
+
     Raises:
         InputError: as `read_stream`; the robot cannot be read, or has another number of joints up to its tip.
     """
@@ -57,16 +60,20 @@ def read_joints(fields: JointFields, log: Log, report: list[str]) -> Stream:
 
     stream = read_stream("joints", fields, log, report)
     robot = Robot(log.folder / fields.urdf, tip=fields.tip)
+    names = [joint.name for joint in robot.joints]
     if len(robot.joints) != stream.values.shape[1]:
-        names = ", ".join(joint.name for joint in robot.joints)
         raise InputError(
             f"joints.columns names {stream.values.shape[1]} joints; {fields.urdf} has {len(robot.joints)} up "
-            f"to {fields.tip!r}: give one column for each of {names}, in this order."
+            f"to {fields.tip!r}: give one column for each of {', '.join(names)}, in this order."
         )
+    columns, values = [str(column) for column in fields.columns], stream.values
+    if columns != names and set(columns) == set(names):
+        values = values[:, [columns.index(name) for name in names]]
+        report.append(f"joints: the columns are ordered by the names of the joints in {fields.urdf}")
     scale = np.array([1.0 if j.kind == "prismatic" else factor(fields.angle) for j in robot.joints])
-    angles = torch.from_numpy(scale * stream.values)
-    values = [robot.base_from_link(fields.tip, rows).numpy() for rows in angles.split(_ROWS)]
-    return Stream("joints", stream.times, np.concatenate(values))
+    angles = torch.from_numpy(scale * values)
+    tips = [robot.base_from_link(fields.tip, rows).numpy() for rows in angles.split(_ROWS)]
+    return Stream("joints", stream.times, np.concatenate(tips))
 
 
 def composed(first: Array, second: Array) -> Array:
@@ -82,6 +89,7 @@ def inverted(pose: Array) -> Array:
 def _poses(name: str, rows: Array, rotation: str, length: float, angle: float) -> Array:
     """Poses (T, 7) of rows of numbers as they are stated."""
     if rotation == "matrix":
+        _refuse_columnwise(name, rows)
         matrix = rows[:, :12].reshape(-1, 3, 4)
         turn = matrix[:, :, :3]
         off = np.abs(turn @ np.swapaxes(turn, 1, 2) - np.eye(3)).max(axis=(1, 2))
@@ -92,6 +100,13 @@ def _poses(name: str, rows: Array, rotation: str, length: float, angle: float) -
             )
         translation, quaternion = matrix[:, :, 3], Rotation.from_matrix(turn).as_quat()
     elif rotation == "vector":
+        turned = np.linalg.norm(rows[:, 3:], axis=1)
+        if angle == 1.0 and (wrong := turned > 2.0 * np.pi).any():
+            row = int(wrong.argmax())
+            raise InputError(
+                f"{name} has a rotation vector of {turned[row]:.4g} rad in row {row}, more than a whole "
+                "turn; state angle: deg."
+            )
         translation, quaternion = rows[:, :3], Rotation.from_rotvec(angle * rows[:, 3:]).as_quat()
     else:
         translation = rows[:, :3]
@@ -105,3 +120,16 @@ def _poses(name: str, rows: Array, rotation: str, length: float, angle: float) -
             )
         quaternion = quaternion / size
     return np.concatenate([length * translation, quaternion[:, [3, 0, 1, 2]]], axis=1)
+
+
+def _refuse_columnwise(name: str, rows: Array) -> None:
+    """Refuse matrices of 16 numbers (T, 16) whose last row is not 0 0 0 1."""
+    wrong = (np.abs(rows[:, 12:] - [0.0, 0.0, 0.0, 1.0][: rows.shape[1] - 12]) > 1e-6).any(axis=1)
+    if wrong.any():
+        row = int(wrong.argmax())
+        columnwise = not rows[row, [3, 7, 11]].any()
+        order = "they are column by column, as of libfranka" if columnwise else "their last is 0 0 0 1"
+        raise InputError(
+            f"{name} has a matrix whose last row is {rows[row, 12:].tolist()}, first in row {row}; give its "
+            f"numbers row by row ({order})."
+        )

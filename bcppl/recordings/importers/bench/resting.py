@@ -49,9 +49,9 @@ def log_evidence(contacts: Sequence[Contact], position: Stream, noise: float, la
     ratios = np.zeros((len(contacts), len(lates), len(LAGS), len(COMPLIANCES)))
     for k, contact in enumerate(contacts):
         yielded = _yielded(contact)
-        path = position.values @ contact.normal
+        along = Stream("path", position.times, position.values @ contact.normal)
         for i, late in enumerate(lates):
-            ratio = _log_ratio(contact, yielded, position.times, path, noise, late)
+            ratio = _log_ratio(contact, yielded, along, noise, late)
             ratios[k, i] = 0.0 if ratio is None else ratio
     return np.asarray(np.logaddexp(np.log(_STRAY), np.log1p(-_STRAY) + ratios))
 
@@ -62,14 +62,12 @@ def _yielded(contact: Contact) -> Array:
     return -np.stack([lfilter([1.0 - d], [1.0, -d], contact.force) for d in decays], axis=1)
 
 
-def _log_ratio(
-    contact: Contact, yielded: Array, times: Array, path: Array, noise: float, late: float
-) -> Array | None:
+def _log_ratio(contact: Contact, yielded: Array, along: Stream, noise: float, late: float) -> Array | None:
     """Of a contact's lateness, (lags, compliances); None where rows are missing."""
-    step = float(times[1] - times[0])
+    step, times = along.step, along.times
     onset, before = contact.time - late, max(BEFORE, _FEWEST * step)
     rows = slice(*np.searchsorted(times, [onset - before, contact.times[-1] - late]).tolist())
-    since, place = times[rows] - onset, path[rows]
+    since, place = times[rows] - onset, along.values[rows]
     free = since < 0.0
     if free.sum() < _FEWEST // 2 or (~free).sum() < 3 or np.diff(since).max() > 3.0 * step:
         return None

@@ -18,6 +18,7 @@ from bcppl.recordings.hdf5 import one_line
 
 Names = Sequence[str | int]
 _ELEMENT = re.compile(r"(.+)\[(\d+)\]")  # a column of an array (T, C): "wrench[3]"
+_NO_NUMBER = re.compile(r"string '(.*)' to float64 at row (\d+)")
 _DELIMITERS = (",", ";", "\t")
 _BEFORE_NAMES = 20  # lines of comments at most
 
@@ -64,6 +65,13 @@ def _csv(path: Path, names: Names) -> Array:
         known, skipped = (above if len(above) == len(cells) else []), first
     else:
         known, skipped = cells, first + 1
+    row = next((line for line in lines[skipped:] if line.strip() and not line.startswith("#")), "")
+    fields = _cells(path, row, delimiter) if row else cells
+    if not _counts(fields) & _counts(cells):
+        raise InputError(
+            f"{path} has {len(cells)} fields in its first line and {len(fields)} in its first row; give each "
+            "column a name, and write decimal points, not commas."
+        )
     places = [_place(path, name, known, len(cells)) for name in names]
     try:
         table = np.loadtxt(
@@ -72,17 +80,35 @@ def _csv(path: Path, names: Names) -> Array:
         )  # fmt: skip
     except ValueError as error:
         cause = reason_of(error)
-        raise InputError(
-            f"{path} holds what is no number ({cause}); write nan where nothing was measured."
-        ) from error
+        remedy = _remedy(cause)
+        raise InputError(f"{path} holds what is no number ({cause}); {remedy}.") from error
     return np.asarray(table, dtype=np.float64)
+
+
+def _counts(cells: Sequence[str]) -> set[int]:
+    """How many fields a line may have: a delimiter at its end may end the last or begin an empty one."""
+    return {len(cells), len(cells) - (cells[-1:] == [""])}
+
+
+def _remedy(cause: str) -> str:
+    """What to do about text that numpy's reader names as no number."""
+    found = _NO_NUMBER.search(cause)
+    text, row = (found[1].strip(), found[2]) if found else ("", "")
+    if re.fullmatch(r"[-+]?\d*,\d+([eE][-+]?\d+)?", text):
+        return "write decimal points, not commas"
+    if re.match(r"\d{4}-\d\d-\d\d|\d+:\d\d", text):
+        return "write times as numbers, such as seconds"
+    if row == "0" and re.search("[^\\W\\d]", text):
+        return "take out the line below the names, if it holds units"
+    return "write nan where nothing was measured"
 
 
 def _cells(path: Path, line: str, delimiter: str | None) -> list[str]:
     if delimiter is None:
         return line.split()
     try:
-        return [cell.strip() for row in csv.reader([line.strip()], delimiter=delimiter) for cell in row]
+        line = line.strip(" \r\n")
+        return [cell.strip() for row in csv.reader([line], delimiter=delimiter) for cell in row]
     except csv.Error as error:
         raise InputError(f"{path} is no table ({one_line(error)}); export it as CSV again.") from error
 

@@ -50,7 +50,7 @@ def show(path: Path, write: Path | None) -> None:
 def _configuration(path: Path, actions: list[Segment], zero: float) -> str:
     streams = (
         "wrench:\n"
-        f"  topic: compensated_base_force  {GUESS}; or measured_force, in the sensor's axes and about it\n"
+        f"  topic: compensated_base_force  {GUESS}; or measured_force: axes and about sensor, no gravity\n"
         "  axes: base\n"
         "  about: base\n"
         "  sign: on_peg                              # what the part exerts on the peg; not documented\n"

@@ -62,6 +62,11 @@ class ReassembleArrays:
                 raise InputError(f"cameras.{camera} names {each.topic!r}; REASSEMBLE has no depth images.")
         refuse_axes(fields.wrench, _SENSOR, "sensor", "in the sensor's axes, about its origin")
         refuse_axes(fields.wrench, _BASE, "base", "in the base's axes, about its origin")
+        if fields.wrench and fields.wrench.topic == _SENSOR and fields.gravity.load == "compensated":
+            raise InputError(
+                f"gravity.load is 'compensated', and the wrench is {_SENSOR}, with the tool's weight in it; "
+                "leave gravity out, or give it load: stated."
+            )
         self._held: dict[str, Numbers] = {}
         within = [f"{group}/{name}" for _, name in named for group in (STATE, STAMPS)]
         with opened(path, _REMEDY, within) as file:
