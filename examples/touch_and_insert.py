@@ -51,18 +51,23 @@ def execute(
     plan: Plan,
     heard: Callable[[Reading], None] = unheard,
     stop_at_hole: bool = False,
+    tare: Array | None = None,
 ) -> tuple[Executor, Reading]:
-    """Execute a plan from the arm's newest stamp on; `heard` is given every reading."""
+    """Execute a plan from the arm's newest stamp on; `heard` is given every reading.
+
+    The arguments after it are those of `Executor`. The program ends where the plan is aborted, or a search
+    for a hole feels no contact.
+    """
     readings = arm.read()[-1:]
     plan = replace(plan, times=plan.times - plan.times[0] + readings[0].stamp + LEAD)
-    executor = Executor(plan, stop_at_hole=stop_at_hole, limits=LIMITS)
+    executor = Executor(plan, tare=tare, stop_at_hole=stop_at_hole, limits=LIMITS)
     while executor.state == "moving":
         for reading in readings:
             heard(reading)
             take(executor, reading)
         arm.command(executor.commanded(reading.stamp + arm.ahead), plan.stiffness)
         readings = arm.read()
-    if executor.state == "aborted":
+    if executor.state in ("aborted", "no contact"):
         raise SystemExit(executor.reason)
     # Up to after the last stamp, by both streams: what is between it and the one before is known.
     until = executor.probe.stamps[executor.taken - 1]
@@ -129,8 +134,8 @@ def touch_and_insert(
         print(f"  spread {' '.join(f'{each:.3f}' for each in spread.tolist())} mm", flush=True)
     insertion = live.insertion()
     move_to(arm, insertion.search.world_from_peg[0], insertion.search, high)
-    _, last = execute(arm, insertion.search, stop_at_hole=True)
-    execute(arm, insertion.push_from(last.world_from_peg))
+    search, last = execute(arm, insertion.search, stop_at_hole=True)
+    execute(arm, insertion.push_from(last.world_from_peg), tare=search.tare)
     hole = poses.inverse(torch.from_numpy(insertion.world_from_hole))
     lowest = torch.tensor([[0.0, 0.0, tip]], dtype=torch.float64)
     at = poses.transform(torch.from_numpy(arm.read()[-1].world_from_peg), lowest)

@@ -31,8 +31,11 @@ from torch import Tensor
 
 from bcppl.arrays import Array
 from bcppl.errors import InputError, reason_of
+from bcppl.robot.inverse_kinematics import driven_joints
 from bcppl.robot.kinematics import Robot
 from bcppl.traces import Trace
+
+FEWEST = 3  # seatings
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,12 +44,16 @@ class Arm:
 
     Attributes:
         robot: the nominal arm.
-        link: whose origin is the ball's nominal centre.
+        link: whose origin is the ball's nominal centre; a fixed joint leads to it, where a URDF file states
+            the ball's position.
         offset: standard deviation of the encoders' offsets, radians.
         shift, turn: standard deviations of the errors of the joints' origins, metres and radians; with both 0
             the URDF is exact, and there is no site `errors`.
         mount: standard deviation of the ball's centre about its nominal position, metres.
         noise: median of the scatter of a seated ball along each axis, metres; known within a factor of four.
+
+    Raises:
+        InputError: the robot has no such link, or a joint moves it.
     """
 
     robot: Robot
@@ -56,6 +63,14 @@ class Arm:
     turn: float = 0.005
     mount: float = 0.003
     noise: float = 0.0003
+
+    def __post_init__(self) -> None:
+        seat = self.robot.joint_to(self.link)
+        if seat.kind != "fixed":
+            raise InputError(
+                f"joint {seat.name!r} of {self.robot.name} moves the ball's link {self.link!r}, so that no "
+                "URDF file can state where the ball is on it; add a link at the ball, on a fixed joint."
+            )
 
     @property
     def spread(self) -> Mapping[str, Tensor]:
@@ -127,7 +142,7 @@ class RemainingError(NamedTuple):
 
     Attributes:
         before, after: root mean square distance of the seated ball from its mean, by the nominal arm and by
-            the posterior mean.
+            the calibrated one.
         deviation: standard deviation of the ball's position along an axis, the scatter included, apart from
             where the whole arm stands.
         length: over which that error changes: a Gaussian process with a squared exponential covariance.
@@ -139,38 +154,54 @@ class RemainingError(NamedTuple):
     length: float
 
 
-def remaining_error(arm: Arm, draws: Trace, weights: Tensor, seatings: Sequence[Tensor]) -> RemainingError:
+def require_sockets(seatings: Sequence[Tensor]) -> None:
+    """Raise InputError where there are too few sockets for an arm's errors to be known from their places."""
+    if len(seatings) < FEWEST:
+        raise InputError(
+            f"an arm cannot be calibrated by {len(seatings)} seating{'s' * (len(seatings) != 1)}, which a "
+            f"motion of the whole arm explains; seat the ball in {FEWEST} sockets at least, far apart."
+        )
+
+
+def remaining_error(
+    arm: Arm, calibrated: Robot, draws: Trace, weights: Tensor, seatings: Sequence[Tensor]
+) -> RemainingError:
     """What is left uncertain over the workspace of the seatings.
 
     Args:
         arm: its prior.
+        calibrated: the arm as it was written (`corrected_joints`).
         draws: N of the posterior.
         weights: (N,) of the draws, with a sum of 1.
         seatings: angles (T, J) of each.
+
+    Raises:
+        InputError: there are fewer than three seatings.
     """
+    require_sockets(seatings)
     latent = {address: draws[address] for address in arm.spread}
     mean = {a: torch.einsum("n,n...->...", weights, value)[None] for a, value in latent.items()}
-    zero = {address: torch.zeros_like(value) for address, value in mean.items()}
 
-    def scatter(values: Mapping[str, Tensor]) -> float:
-        each = [arm.positions(values, q)[0] for q in seatings]
+    def scatter(robot: Robot) -> float:
+        each = [robot.position(arm.link, q) for q in seatings]
         squares = torch.cat([(x - x.mean(dim=0)).square().sum(dim=1) for x in each])
         return float(squares.mean().sqrt())
 
     # One posture of each seating: how it is seated adds as much as the calibration leaves.
     postures = torch.stack([q[0] for q in seatings])
     place = arm.positions(mean, postures)[0]
-    error = _bent(place, arm.positions(latent, postures) - place)
+    # A motion of the whole arm has 6 degrees of freedom of the 3 T that places have, and fits that much.
+    error = _bent(place, arm.positions(latent, postures) - place) / math.sqrt(1.0 - 2.0 / len(place))
     variance = float(torch.einsum("n,nti->ti", weights, error.square()).mean())
-    after = scatter(mean)
+    after = scatter(calibrated)
     first, second = torch.triu_indices(len(place), len(place), 1)
     apart = (place[first] - place[second]).norm(dim=1)
     covered = torch.einsum("n,nti,nti->t", weights, error[:, first], error[:, second]) / 3.0
     correlation = (covered / max(variance, 1e-30)).clamp(1e-3, 1.0 - 1e-9)
     # exp(-r^2 / 2 l^2) by least squares of its logarithm, through the origin.
-    curvature = float((-2.0 * correlation.log() * apart**2).sum() / (apart**4).sum()) if len(apart) else 0.0
+    curvature = float((-2.0 * correlation.log() * apart**2).sum() / (apart**4).sum())
     length = 1.0 / math.sqrt(max(curvature, 1e-4))
-    return RemainingError(scatter(zero), after, math.sqrt(variance + after**2 / 3.0), min(length, 1.0))
+    return RemainingError(scatter(arm.robot), after, math.sqrt(variance + after**2 / 3.0), min(length, 1.0))
 
 
 def _bent(place: Tensor, error: Tensor) -> Tensor:
@@ -190,28 +221,27 @@ def _bent(place: Tensor, error: Tensor) -> Tensor:
 def corrected_joints(arm: Arm, draws: Trace, weights: Tensor) -> dict[str, Array]:
     """The joints' origins `parent_from_child` (4, 4) at the posterior mean, by name.
 
-    An encoder's offset turns the joint's origin about its axis. A fixed joint to the ball's link leads to
-    where the ball is. Draws and their weights are those of `remaining_error`.
+    An encoder's offset turns the joint's origin about its axis, and in proportion the origins of joints that
+    mimic it. The fixed joint to the ball's link leads to where the ball is. Draws and their weights are those
+    of `remaining_error`.
     """
     mean = {a: torch.einsum("n,n...->...", weights, draws[a]).numpy() for a in arm.spread}
     origins = {}
-    for k, joint in enumerate(arm.robot.joints):
+    for joint, k, factor, _ in driven_joints(arm.robot):
         matrix = joint.parent_from_child.copy()
-        if "errors" in mean:
+        if "errors" in mean and joint is arm.robot.joints[k]:
             matrix[:3, 3] += mean["errors"][k, :3]
             matrix[:3, :3] = matrix[:3, :3] @ Rotation.from_rotvec(mean["errors"][k, 3:]).as_matrix()
-        offset = mean["offsets"][k] * joint.axis
+        offset = factor * mean["offsets"][k] * joint.axis
         if joint.kind == "prismatic":
             matrix[:3, 3] += matrix[:3, :3] @ offset
         else:
             matrix[:3, :3] = matrix[:3, :3] @ Rotation.from_rotvec(offset).as_matrix()
         origins[joint.name] = matrix
     seat = arm.robot.joint_to(arm.link)
-    if seat.kind == "fixed":
-        matrix = seat.parent_from_child.copy()
-        matrix[:3, 3] += matrix[:3, :3] @ mean["ball"]
-        origins[seat.name] = matrix
-    return origins
+    matrix = seat.parent_from_child.copy()
+    matrix[:3, 3] += matrix[:3, :3] @ mean["ball"]
+    return {**origins, seat.name: matrix}
 
 
 def laplace_proposal(

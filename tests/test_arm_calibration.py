@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from importlib.resources import files
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pyro
@@ -23,6 +25,7 @@ from bcppl.models.arm_calibration import (
     laplace_proposal,
     observations,
     read_seatings,
+    remaining_error,
     sockets,
 )
 from bcppl.models.robots import load_robot
@@ -184,7 +187,7 @@ def test_seatings_are_ordered_by_number(tmp_path: Path) -> None:
 
 
 def test_another_number_of_joints_is_refused() -> None:
-    arm = Arm(load_robot("panda", tip="panda_hand"))
+    arm = Arm(load_robot("panda", tip="panda_hand"), "panda_hand")
     with pytest.raises(InputError, match="has 6 angles for each stamp; give 7, in the order panda_joint1,"):
         laplace_proposal(arm, [torch.zeros(5, 6).double()])
 
@@ -243,6 +246,77 @@ def test_corrected_joints_lead_to_the_same_places_as_offsets_and_errors(tmp_path
     found = Robot(tmp_path / "new.urdf", tip="panda_hand").position("panda_hand", angles)
     assert float((found - expected).abs().max()) < 1e-9
     assert float((robot.position("panda_hand", angles) - expected).abs().max()) > 1e-3
+
+
+MIMICKING = """<robot name="geared"><link name="base"/><link name="upper"/><link name="lower"/>
+<link name="slide"/><link name="ball_link"/>
+<joint name="shoulder" type="revolute"><parent link="base"/><child link="upper"/><origin xyz="0.1 0 0.3"
+rpy="0.3 -1.2 0.2"/><axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="1" velocity="1"/></joint>
+<joint name="elbow" type="revolute"><parent link="upper"/><child link="lower"/><origin xyz="0.3 0 0.1"
+rpy="-1 0.5 0.2"/><axis xyz="0 1 1"/><limit lower="-2" upper="2" effort="1" velocity="1"/>
+<mimic joint="shoulder" multiplier="-1.5" offset="0.2"/></joint>
+<joint name="rail" type="prismatic"><parent link="lower"/><child link="slide"/><origin xyz="0 0.1 0"/>
+<axis xyz="1 0 0"/><limit lower="-1" upper="1" effort="1" velocity="1"/><mimic joint="elbow"/></joint>
+<joint name="seat" type="fixed"><parent link="slide"/><child link="ball_link"/>
+<origin xyz="0.03 0 0.1"/></joint>
+</robot>"""
+
+
+def test_offsets_are_passed_on_to_mimicking_joints(tmp_path: Path) -> None:
+    """Also to one that mimics a mimicking one."""
+    (tmp_path / "nominal.urdf").write_text(MIMICKING)
+    robot = Robot(tmp_path / "nominal.urdf", tip="ball_link")
+    arm, angles = Arm(robot), torch.linspace(-0.8, 0.8, 5, dtype=torch.float64)[:, None]
+    torch.manual_seed(1)
+    trace, _ = generate(_prior, (arm,), {}, 1)
+    written = corrected(tmp_path / "nominal.urdf", corrected_joints(arm, trace, torch.ones(1).double()))
+    (tmp_path / "new.urdf").write_text(written)
+    expected = arm.positions({a: trace[a] for a in arm.spread}, angles)[0]
+    found = Robot(tmp_path / "new.urdf", tip="ball_link").position("ball_link", angles)
+    assert float((found - expected).abs().max()) < 1e-9
+    assert float((robot.position("ball_link", angles) - expected).abs().max()) > 1e-4
+
+
+def test_a_ball_on_a_link_that_a_joint_moves_is_refused() -> None:
+    """Its position would not be in the written file, while it counts in what is left uncertain."""
+    with pytest.raises(InputError, match="'panda_joint7' of panda moves the ball's link 'panda_link7'"):
+        Arm(load_robot("panda", tip="panda_link7"), link="panda_link7")
+
+
+class Unsure:
+    """Balls of which each is known to a standard deviation of 1 mm, and what is written scatters by 3 mm."""
+
+    link, spread = "ball", Mapping
+    robot = SimpleNamespace(position=lambda link, q: torch.zeros(len(q), 3).double())
+    written = SimpleNamespace(position=lambda link, q: torch.tensor([[3e-3, 0.0, 0.0], [-3e-3, 0.0, 0.0]]))
+
+    def __init__(self, sockets: int) -> None:
+        torch.manual_seed(sockets)
+        self.place = torch.rand(sockets, 3).double()
+        self.spread = {"off": torch.ones(sockets, 3)}
+        self.draws = {"off": 1e-3 * torch.randn(2000, sockets, 3).double()}
+
+    def positions(self, values: Mapping[str, Tensor], angles: Tensor) -> Tensor:
+        return self.place + values["off"]
+
+    def left(self) -> Any:
+        seatings = [torch.zeros(2, 6).double() for _ in self.place]
+        weights = torch.full((2000,), 1.0 / 2000).double()
+        return remaining_error(self, self.written, self.draws, weights, seatings)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("sockets", [3, 4, 10])
+def test_what_is_left_uncertain_is_that_of_single_places(sockets: int) -> None:
+    """Whatever their number, though a motion of the whole arm fits three places better than ten."""
+    left = Unsure(sockets).left()
+    assert (left.before, left.after) == (0.0, pytest.approx(0.003))
+    assert left.deviation**2 - left.after**2 / 3.0 == pytest.approx(1e-6, rel=0.06)
+
+
+@pytest.mark.parametrize("sockets", [1, 2])
+def test_fewer_than_three_sockets_are_refused(sockets: int) -> None:
+    with pytest.raises(InputError, match=f"by {sockets} seatings?, .* seat the ball in 3 sockets at least"):
+        Unsure(sockets).left()
 
 
 def _prior(arm: Arm) -> None:

@@ -28,6 +28,7 @@ from bcppl.inference.planning.motion_constraints import (
     collision_free,
     contact_at_mid_stroke,
     force_at_most,
+    not_from_below,
     within_reach,
 )
 from bcppl.inference.planning.motions import expected_contacts, pressing_force
@@ -194,6 +195,35 @@ def test_candidates_out_of_an_arms_reach_are_excluded() -> None:
     ) as caught:
         require_candidates(feasible([far], [within_reach(ArmWithPeg(arm, "panda_hand_tcp", held, here))]))
     assert_one_sentence(str(caught.value))
+
+
+def test_reach_is_asked_for_between_the_ends_of_a_motion() -> None:
+    """The arm reaches either side of its base, and not the way between them, through the base."""
+    arm = load_robot("panda", tip="panda_hand_tcp")
+    held, here = np.eye(7)[4], np.eye(7)[3]
+    reach = within_reach(ArmWithPeg(arm, "panda_hand_tcp", held, here))
+    knots = here + np.array([[-0.1, -0.45, 0.3], [-0.1, 0.45, 0.3]]) @ np.eye(3, 7)
+
+    def plan(poses: np.ndarray) -> Plan:
+        return Plan("across", [0.0, 4.0], poses, ("free",), 4.0, np.full(6, 100.0), np.full(6, 10.0))
+
+    assert reach.satisfied([plan(knots), *(plan(knots[[k, k]]) for k in (0, 1))]) == [False, True, True]
+
+
+def test_no_hand_comes_from_below() -> None:
+    """Of a part upside down the sides can be touched, but only by a hand that is under it."""
+    scene, _, _ = planned(5)
+    spot, turns = SurfacePoint(np.array([0.03, 0.0, -0.01]), np.eye(3)[0]), {}
+    for name, degrees in (("upright", 0.0), ("on its side", 90.0), ("upside down", 180.0)):
+        turn = torch.tensor([0.0, 0.0, 0.0, math.radians(degrees), 0.0, 0.0], dtype=torch.float64)
+        level = about(scene, 0.001)
+        mean = torch.tensor([0.5, 0.0, 0.15, 1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
+        around = poses.retract(mean.expand(40, 7), poses.local(level.mean, level.world_from_part))
+        belief = Belief(poses.retract(around, turn), level.log_weights)
+        turns[name] = touch(belief, scene.part, scene.peg, spot, name=name)
+    found = feasible(list(turns.values()), [not_from_below()])
+    assert [name_of(one) for one in found] == ["upright", "on its side"]
+    assert found.excluded == {"come from below": 1}
 
 
 def test_the_largest_variance_is_of_the_surface_along_the_stroke() -> None:

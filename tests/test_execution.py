@@ -25,6 +25,16 @@ def descent(force: float = 4.0, speed: float = 0.02, **fields: object) -> Plan:
     return replace(plan, **fields)
 
 
+def search(**fields: object) -> Plan:
+    """At rest, 20 mm down guarded, 4 mm farther held, and 5 mm along x searching, in ten motions."""
+    times = np.array([0.0, 0.2, 1.2, 1.4, *np.linspace(1.5, 2.4, 10)])
+    knots = np.tile([0.0, 0.0, 0.0, *UPRIGHT], (14, 1))
+    knots[2:, 2], knots[3:, 2], knots[4:, 0] = -0.02, -0.024, np.linspace(0.0005, 0.005, 10)
+    manners = ("free", "guarded", "held", *("searching",) * 10)
+    plan = Plan("search", times, knots, manners, 4.0, np.ones(6), np.ones(6), sink=0.001)
+    return replace(plan, **fields)
+
+
 def executed(
     executor: Executor, wall: float, bias: float = 3.0, hits: dict[int, float] | None = None
 ) -> Array:
@@ -94,3 +104,73 @@ def test_a_plan_that_is_too_fast_or_too_short_is_refused() -> None:
         Executor(replace(descent(), rate=4.0))
     with pytest.raises(InputError, match=r"limit of force is -1"):
         Executor(descent(), limits=Limits(force=-1.0))
+
+
+def test_a_search_that_feels_no_contact_is_in_no_hole() -> None:
+    """As without a part, or with a sensor that reads nothing."""
+    executor = Executor(search(), stop_at_hole=True)
+    executed(executor, wall=-1.0)
+    assert executor.state == "no contact" and not executor.stops and "felt no contact" in executor.reason
+    # A probe that need not find a hole goes on to its end.
+    executor = Executor(search())
+    executed(executor, wall=-1.0)
+    assert executor.state == "finished" and not executor.stops
+
+
+@pytest.mark.parametrize(("ends", "state"), [(150, "in hole"), (400, "finished")])
+def test_a_peg_is_in_a_hole_once_it_sinks_below_its_contact(ends: int, state: str) -> None:
+    executor = Executor(search(), stop_at_hole=True)
+    while executor.state == "moving":
+        led, wall = executor.commanded(), -0.01 if executor.taken < ends else -1.0
+        height = max(float(led[2]), wall)
+        pose = np.array([led[0], led[1], height, *UPRIGHT])
+        executor.sample(np.array([0.0, 0.0, SPRING * (height - led[2])]), lambda pose=pose: pose)
+    assert executor.state == state and executor.contact_pose is not None
+
+
+def test_a_peg_that_met_nothing_on_its_way_down_is_in_a_hole_once_walls_hold_it() -> None:
+    executor = Executor(search(), stop_at_hole=True)
+    while executor.state == "moving":
+        led = executor.commanded()
+        held = np.array([min(float(led[0]), 0.0001), *led[1:]])
+        force = np.array([SPRING * (held[0] - led[0]), 0.0, 0.0])
+        executor.sample(force, lambda pose=held: pose)
+    assert executor.state == "in hole" and 0.002 < executor.commanded()[0] < 0.003
+
+
+def test_a_plan_that_begins_pressed_needs_a_tare_and_stops_at_its_force() -> None:
+    pressed = descent(manners=("guarded", "guarded", "free"))
+    with pytest.raises(InputError, match="begins with a motion that is guarded"):
+        Executor(pressed)
+    executor = Executor(pressed, tare=np.array([0.0, 0.0, 3.0]))
+    executed(executor, wall=-1.0, bias=50.0)
+    assert executor.stops[0] < 0.05
+
+
+def test_a_load_that_comes_or_changes_during_the_tare_is_no_tare() -> None:
+    def at(bias: float, hits: dict[int, float]) -> Executor:
+        executor = Executor(descent(), limits=Limits(force=20.0))
+        executed(executor, wall=-1.0, bias=bias, hits=hits)
+        return executor
+
+    assert at(3.0, {}).state == "finished" and at(-10.0, {}).state == "finished"
+    sudden = at(3.0, dict.fromkeys(range(3, 400), 30.0))
+    assert sudden.taken == 5 and "exceeded the limit of 20 N" in sudden.reason
+    growing = at(3.0, {k: 2.0 * k for k in range(400)})
+    assert growing.taken == 10 and "varied by 5.7 N while it was tared" in growing.reason
+    loaded = at(200.0, {})
+    assert loaded.state == "aborted" and "tared at 200 N, above 20 N" in loaded.reason
+
+
+def test_the_tare_is_that_of_the_first_ten_samples_for_the_plan_that_follows() -> None:
+    executor = Executor(descent())
+    executed(executor, wall=-0.01, bias=3.0)
+    np.testing.assert_allclose(executor.tare, [0.0, 0.0, 3.0])
+
+
+def test_a_pressed_slide_is_no_faster_than_what_may_touch() -> None:
+    slide = descent(manners=("free", "guarded", "held"))
+    with pytest.raises(InputError, match="motion 2 of plan 'down' is held at 200 mm/s"):
+        Executor(slide, limits=Limits(speed=0.1, free_speed=0.5))
+    # Speeds are those of the plan, whatever the clock.
+    Executor(replace(slide, times=slide.times + 1.7e9), limits=Limits(speed=0.2))

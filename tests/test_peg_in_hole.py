@@ -15,9 +15,9 @@ from bcppl.errors import InputError
 from bcppl.inference.design.rules import can_be_linearised
 from bcppl.inference.filters import bayes_contact, guided_smc
 from bcppl.inference.planning.metrology import three_two_one
-from bcppl.models import look_and_touch, peg_in_hole
+from bcppl.models import grasped_peg, look_and_touch, peg_in_hole
 from bcppl.models.worlds import peg_in_hole as world
-from bcppl.recordings import ProbeWindow, Recording
+from bcppl.recordings import Measurement, ProbeWindow, Recording, Touch
 from bcppl.sensors.capabilities import Screens
 from bcppl.sensors.likelihoods.simulated_probe import CONTACT
 from bcppl.sensors.scene import Scene
@@ -167,6 +167,32 @@ def test_what_is_explained_of_a_probe_is_a_setting() -> None:
             peg_in_hole.prepare(recorded(), evidence=wrong)
     with pytest.raises(InputError, match="friction = -1"):
         peg_in_hole.prepare(recorded(), friction=(-1.0, 0.3))
+
+
+def at_rate(stride: int, name: str) -> Measurement:
+    """All windows of the shipped probe as one, every so manyth of its 100 stamps a second kept."""
+    windows = [m for m in recorded().measurements if isinstance(m.action, ProbeWindow)]
+    probe, columns = windows[0].action.probe, ("times", "wrench", "world_from_peg")
+    rows = [np.concatenate([getattr(m.observation, column) for m in windows])[::stride] for column in columns]
+    return Measurement(
+        ProbeWindow(dataclasses.replace(probe, name=name, stamps=rows[0]), 0, len(rows[0])), Touch(*rows)
+    )
+
+
+def test_probes_of_any_rate_are_explained_and_those_of_several() -> None:
+    """The wrench's filter is of each probe's rate; slow probes, and those without contacts, have none."""
+    slow = [at_rate(stride, f"every {stride}") for stride in (1, 2, 3, 10)]
+    recording = dataclasses.replace(recorded(), measurements=slow)
+    for module, settings in ((peg_in_hole, {}), (grasped_peg, {}), (peg_in_hole, {"evidence": ("gaps",)})):
+        prepared = module.prepare(recording, **settings)
+        sensings = [prepared.likelihoods["window"].sensing(m.action.probe) for m in slow]
+        np.testing.assert_allclose([s.rate for s in sensings], [100.0, 50.0, 100.0 / 3.0, 10.0], rtol=1e-6)
+        assert [s.cutoff for s in sensings] == ([None] * 4 if settings else [20.0, 20.0, None, None])
+        values = prepared.observed(slow)
+        touched = [bool(torch.isfinite(v).any()) for a, v in values.items() if a.startswith("contacts")]
+        assert touched == ([] if settings else [True] * 4)
+    trace, _ = generate(peg_in_hole.peg_in_hole, (prepared, [m.action for m in slow]), values, 2)
+    assert bool(torch.isfinite(trace.log_prob(*values)).all())
 
 
 def test_contact_locations_alone_have_no_geometry() -> None:

@@ -17,12 +17,17 @@ from typer.testing import CliRunner
 
 import bcppl.sensors.plausibility.contacts
 import bcppl.sensors.plausibility.images
+from bcppl import Belief, poses
 from bcppl.cli import app
+from bcppl.contact.physics import PegPhysics
 from bcppl.geometry.gap import Gap
+from bcppl.inference.planning import plan_candidates, three_two_one
 from bcppl.models import load_recording
 from bcppl.models.worlds.bench.parameters import BenchParameters
 from bcppl.models.worlds.bench.scene import bench_scene
+from bcppl.models.worlds.simulated_sensors import windows
 from bcppl.recordings import Recording, problems, save
+from bcppl.robot.motion import Probe
 from bcppl.sensors.plausibility import doubts
 from tests.made_recordings import assert_one_sentence, full
 
@@ -84,6 +89,32 @@ def test_a_recording_of_a_few_pixels_is_not_judged() -> None:
 )
 def test_what_cannot_be_told_gives_no_other_cause(name: str) -> None:
     assert doubts(plausibility.MISTAKES[name].made(right(3, False))) == []
+
+
+def test_a_probe_that_begins_in_contact_is_named_and_nothing_else() -> None:
+    """Its wrench is tared by the contact: where the peg is free it seems pulled, and a wrong cause fits."""
+    scene, knots = bench_scene(3), poses.identity(4)
+    surface = float(scene.part.vertices[:, 2].max()) - float(scene.peg.vertices[:, 2].min())
+    knots[:, :3] = torch.tensor([[-0.02, -0.02, surface + up] for up in (-0.002, -0.002, 0.02, 0.04)])
+    path = poses.compose(torch.from_numpy(scene.truth), knots).numpy()
+    stiffness, damping = np.array([2500.0] * 3 + [150.0] * 3), np.array([120.0] * 3 + [2.5] * 3)
+    probe = Probe("up", np.array([0.0, 0.6, 1.2, 2.0]), path, stiffness, damping, np.arange(0.0, 2.0, 0.01))
+    rollout = PegPhysics(scene.part, scene.peg).start(torch.from_numpy(scene.truth)[None], probe).advance(200)
+    measured = windows(probe, rollout.wrench[0], rollout.world_from_peg[0], 50)
+    (found,) = doubts(replace(scene.look(), measurements=measured))
+    assert_one_sentence(found)
+    assert "probe 'up' has a force of" in found and "probably it begins in contact" in found
+
+
+def test_a_frame_whose_z_axis_points_to_the_pegs_tip_is_doubted_by_check_and_planners() -> None:
+    recording = right(3, False)
+    turned = recording.peg.moved([0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0])
+    (found,) = doubts(plausibility.windows_left_out(replace(recording, peg=turned)))
+    assert_one_sentence(found)
+    belief = Belief(poses.identity(4) + 1e-3 * torch.eye(4, 7).double(), torch.zeros(4).double())
+    for plans in (three_two_one, functools.partial(plan_candidates, kinds={"touch": 1})):
+        with pytest.warns(RuntimeWarning, match=re.escape(found)):
+            plans(belief, recording.part, turned)
 
 
 def test_several_mistakes_are_named_one_by_one() -> None:

@@ -13,6 +13,8 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.arrays import Array
+from bcppl.contact.mujoco_model import ContactParameters
+from bcppl.contact.physics import PegPhysics
 from bcppl.contact.sensing.contact_detection import ContactDetector
 from bcppl.contact.sensing.episodes import EpisodeExtractor, Rows
 from bcppl.contact.touch import Touch
@@ -137,6 +139,31 @@ def test_stamps_at_other_rates_inform_nearly_as_much() -> None:
     for rate in (50, 200, 500, 2000):
         ratio = information_at(rate)[[2, 0], [2, 0]].sqrt() / usual
         assert bool(((ratio > 0.5) & (ratio < 2.0)).all()), (rate, ratio)
+
+
+@functools.cache
+def swung(mass: float) -> Recording:
+    """A tool of so many kilograms that is moved to and fro by 80 mm, 30 mm above the block, in 2 s."""
+    recording, times = probed(100), np.arange(0.0, 2.0, 0.02)
+    command = np.tile(poses.identity().numpy(), (len(times), 1))
+    command[:, 0], command[:, 2] = 0.04 * (1.0 - np.cos(2.0 * np.pi * np.clip(times - 0.3, 0.0, 1.5))), 0.08
+    stiffness, damping = np.array([2500.0] * 3 + [150.0] * 3), np.array([120.0] * 3 + [2.5] * 3)
+    probe = Probe("swung", times, command, stiffness, damping, np.arange(0.0, 1.98, 0.01))
+    physics = PegPhysics(recording.part, recording.peg, ContactParameters(tool_mass=mass))
+    rollout = physics.start(poses.identity(1), probe).advance(len(probe.stamps))
+    touch = Touch(probe.stamps, rollout.wrench[0], rollout.world_from_peg[0])
+    return replace(recording, measurements=[Measurement(ProbeWindow(probe, 0, len(probe.stamps)), touch)])
+
+
+@pytest.mark.parametrize("mass", [0.2, 2.0, 5.0])
+def test_a_tool_of_stated_mass_is_not_felt_where_it_accelerates(mass: float) -> None:
+    counts = {}
+    for stated in (None, mass):
+        _, values = values_of(swung(mass), look_and_touch.model.with_settings(tool_mass=stated))
+        rows = torch.cat([new_rows(value) for _, value in values])
+        counts[stated] = int((rows[:, FELT] == 1.0).sum())
+    assert counts == {None: counts[None], mass: 0}
+    assert (counts[None] > 10) == (mass > 1.0)
 
 
 @pytest.mark.parametrize("profile", ["perfect", "ur5e"])

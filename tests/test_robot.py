@@ -20,6 +20,7 @@ from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera, looking_at
 from bcppl.models.robots import SHIPPED, load_robot
 from bcppl.rendering.ray_casting import RayCaster
+from bcppl.robot.inverse_kinematics import joint_paths
 from bcppl.robot.kinematics import Robot
 
 FOLDER = Path(__file__).parents[1] / "models/robots"
@@ -149,6 +150,30 @@ def test_mimicking_joints_follow_and_held_joints_stay() -> None:
     held = load_robot("panda", held={"panda_finger_joint1": 0.03})
     again = held.base_from_links([0.0, 0, 0, -1, 0, 1, 0], links=["panda_leftfinger"])
     assert same(again, fingers[:1])
+
+
+FOLLOWED = """<robot name="geared"><link name="base"/><link name="upper"/><link name="lower"/>
+<link name="tip"/>
+<joint name="shoulder" type="revolute"><parent link="base"/><child link="upper"/><axis xyz="0 0 1"/>
+<limit lower="-2" upper="2" effort="1" velocity="1"/></joint>
+<joint name="elbow" type="revolute"><parent link="upper"/><child link="lower"/><origin xyz="0.3 0 0"/>
+<axis xyz="0 0 1"/><limit lower="LOWER" upper="0.5" effort="1" velocity="1"/>
+<mimic joint="shoulder" multiplier="-2" offset="0.1"/></joint>
+<joint name="end" type="fixed"><parent link="lower"/><child link="tip"/><origin xyz="0.2 0 0"/></joint>
+</robot>"""
+
+
+def test_paths_are_within_the_limits_of_mimicking_joints(tmp_path: Path) -> None:
+    """The elbow, at 0.1 - 2 q, may be between -1 and 0.5: the shoulder between -0.2 and 0.55."""
+    (tmp_path / "geared.urdf").write_text(FOLLOWED.replace("LOWER", "-1"))
+    geared = Robot(tmp_path / "geared.urdf", tip="tip")
+    angles = torch.tensor([-0.6, -0.25, -0.15, 0.5, 0.6, 1.5], dtype=torch.float64)[:, None]
+    paths = joint_paths(geared, "tip", geared.base_from_link("tip", angles)[:, None].numpy())[:, 0]
+    assert np.isfinite(paths[:, 0]).tolist() == [False, False, True, True, False, False]
+    assert np.abs(paths - angles.numpy())[2:4].max() < 0.01
+    (tmp_path / "geared.urdf").write_text(FOLLOWED.replace("LOWER", "-1").replace('"0.1"', '"9"'))
+    with pytest.raises(InputError, match="no value of joint 'shoulder' of geared is within its limits"):
+        joint_paths(Robot(tmp_path / "geared.urdf", tip="tip"), "tip", poses.identity(1)[None].numpy())
 
 
 def test_a_wrist_camera_moves_with_the_wrist(robot: Robot) -> None:

@@ -15,7 +15,7 @@ from bcppl import poses
 from bcppl.beliefs import Belief
 from bcppl.contact.sensing.contact_detection import ContactDetector
 from bcppl.errors import InputError
-from bcppl.geometry.extrusion import block, block_with_square_hole, box_peg, round_peg
+from bcppl.geometry.extrusion import block, block_with_square_hole, box_peg, extruded, round_peg
 from bcppl.geometry.gap import PegGap
 from bcppl.inference.planning.faces import boundary_points, points_on_top, section, sides
 from bcppl.inference.planning.metrology import ROCKED, MetrologyParameters, three_two_one
@@ -290,6 +290,37 @@ def test_a_rocked_peg_leans_and_turns_both_ways_about_its_tip_and_stays_in_conta
     for k in torch.nonzero(leaning)[:, 0].tolist():
         during = (stamps > plan.times[k - 1]) & (stamps < plan.times[k])
         assert float(gap[torch.from_numpy(during)].max()) < 2e-4
+
+
+@pytest.mark.parametrize("size", [0.25, 0.5])
+def test_a_plan_around_a_large_part_is_no_faster_but_longer(size: float) -> None:
+    part, limits = block_with_square_hole((size, size, 0.025)), MetrologyParameters()
+    plan = three_two_one(Belief(poses.identity(4), torch.zeros(4).double()), part, box_peg(0.016, 0.08))
+    speed = np.linalg.norm(np.diff(plan.world_from_peg[:, :3], axis=0), axis=1) / np.diff(plan.times)
+    stated = {"free": limits.free_speed, "guarded": limits.guarded_speed, "held": limits.sliding_speed}
+    assert (speed <= 1.0001 * np.array([stated[manner] for manner in plan.manners])).all()
+    assert plan.times[-1] > 2.0 * limits.duration
+    first = plan.manners.index("guarded")
+    assert 0.5 * plan.times[first : first + 2].sum() == pytest.approx(limits.first_contact)
+
+
+U_SHAPED = [(0, 0), (0, 0.1), (0.08, 0.1), (0.08, 0.08), (0.02, 0.08), (0.02, 0.02), (0.08, 0.02), (0.08, 0)]
+T_SHAPED = [(0, 0.1), (0, 0.08), (0.04, 0.08), (0.04, 0), (0.06, 0), (0.06, 0.08), (0.1, 0.08), (0.1, 0.1)]
+
+
+@pytest.mark.parametrize("corners", [U_SHAPED, T_SHAPED])
+def test_slides_stay_on_a_concave_part(corners: list[tuple[float, float]]) -> None:
+    """A side of a part's convex hull that crosses a recess is none of its own."""
+    part, peg = extruded("concave", shapely.Polygon(corners), -0.02, 0.0), box_peg(0.008, 0.08)
+    outline = shapely.Polygon(corners).exterior
+    on_it = [outline.distance(shapely.Point(end)) for side in sides(part, -0.01) for end in side[:2]]
+    assert max(on_it) < 3e-4
+    plan = three_two_one(Belief(poses.identity(4), torch.zeros(4).double()), part, peg)
+    gap, share = PegGap(part, peg), np.linspace(0.0, 1.0, 9)[:, None]
+    for k, manner in enumerate(plan.manners):
+        if manner == "held":
+            way = (1.0 - share) * plan.world_from_peg[k] + share * plan.world_from_peg[k + 1]
+            assert float(gap(poses.identity(1), torch.from_numpy(way)).distance.max()) < 0.0
 
 
 def test_a_part_with_no_room_on_top_is_refused() -> None:

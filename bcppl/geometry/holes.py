@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import itertools
+from bisect import bisect_left
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 import shapely
 import torch
+import trimesh
 from scipy.optimize import minimize_scalar
 from shapely.affinity import rotate, translate
 
@@ -24,6 +26,7 @@ _LEAST = 0.0005  # m: smallest extent of a hole for a peg
 _WIDER = 1e-5  # m by which a chamfered section is wider, at least
 _TURNS = 720  # yaws of the grid search
 _OUT = 2e-6  # m by which a peg as wide as its hole protrudes by rounding
+_SLIVER = 1e-12  # m^2: a triangle of a peg's mesh that covers less is of an upright wall
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,8 +36,8 @@ class Hole:
     Attributes:
         part_from_hole: (7,) its frame: origin at the centroid of its outline in the plane of the part's top,
             z out of the material, x and y the part's.
-        outline: its narrowest cross section, in its frame, metres.
-        depth: below the top, metres.
+        outline: its narrowest cross section down to its end, in its frame, metres.
+        depth: of its end below the top, metres.
         chamfer: depth of the part of it that is wider than its outline, metres.
         through: whether it is a through hole.
     """
@@ -46,12 +49,14 @@ class Hole:
     through: bool
 
 
-def hole_of(part: Part, inside: tuple[float, float] | None = None) -> Hole:
+def hole_of(part: Part, inside: tuple[float, float] | None = None, peg: Part | None = None) -> Hole:
     """The hole in a part's top, from cross sections of its mesh between the levels of its vertices.
 
     Args:
         part: its z axis points out of its top; the walls of its hole are parallel to z, except in a chamfer.
-        inside: (x, y) of a point in the hole, in the part's frame; needed where there are several holes.
+        inside: (x, y) of a point in the hole, metres in the part's frame; needed where there are several.
+        peg: that is to go in: the hole ends where the peg no longer fits, at a drill's point or at the floor
+            of a counterbore. Without one, or with one that does not fit at all, it ends where it is closed.
 
     Raises:
         InputError: there is no hole in the top, none around the point, or there are several and no point is
@@ -80,17 +85,24 @@ def hole_of(part: Part, inside: tuple[float, float] | None = None) -> Hole:
         if not around:
             break
         rings.append(around[0])
-    least = min(ring.area + _WIDER * ring.length for ring in rings)
-    narrowest = next(k for k, ring in enumerate(rings) if ring.area <= least)
-    ring, top = rings[narrowest], levels[0]
-    centre = np.array([ring.centroid.x, ring.centroid.y, top])
-    return Hole(
-        np.concatenate([centre, [1.0, 0.0, 0.0, 0.0]]),
-        translate(ring, -centre[0], -centre[1]),
-        top - levels[len(rings)],
-        top - levels[narrowest],
-        len(rings) == len(sections),
-    )
+
+    def down_to(count: int) -> Hole:
+        """The hole down to the lower end of a number of sections."""
+        least = min(ring.area + _WIDER * ring.length for ring in rings[:count])
+        narrowest = next(k for k, ring in enumerate(rings) if ring.area <= least)
+        ring, top = rings[narrowest], levels[0]
+        centre = np.array([ring.centroid.x, ring.centroid.y, top])
+        return Hole(
+            np.concatenate([centre, [1.0, 0.0, 0.0, 0.0]]),
+            translate(ring, -centre[0], -centre[1]),
+            top - levels[count],
+            top - levels[narrowest],
+            count == len(sections),
+        )
+
+    counts = range(1, len(rings) + 1)
+    taking = 0 if peg is None else bisect_left(counts, True, key=lambda n: not _takes(down_to(n), peg))
+    return down_to(taking or len(rings))
 
 
 class Fit(NamedTuple):
@@ -106,11 +118,13 @@ class Fit(NamedTuple):
 def fit_in(hole: Hole, peg: Part) -> Fit:
     """The insertion pose of a peg and its clearance; of several yaws that fit, the smallest.
 
+    The hole has to take all of the peg that goes in: its lowest part, as long as the hole is deep.
+
     Raises:
-        InputError: the peg fits at no yaw.
+        InputError: the peg fits at no yaw, or has no lower end.
     """
     low = float(peg.vertices[:, 2].min())
-    outline = _cut(peg, low + 0.1 * float(peg.extent[2]))[0]
+    outline = _outline(peg, hole.depth)
     held = np.array([outline.centroid.x, outline.centroid.y])
     centred = translate(outline, *-held)
 
@@ -139,6 +153,25 @@ def fit_in(hole: Hole, peg: Part) -> Fit:
     rotation = np.array([np.cos(0.5 * yaw), 0.0, 0.0, np.sin(0.5 * yaw)])
     shift = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]) @ held
     return Fit(np.concatenate([-shift, [-low], rotation]), clearance)
+
+
+def _takes(hole: Hole, peg: Part) -> bool:
+    try:
+        fit_in(hole, peg)
+    except InputError:
+        return False
+    return True
+
+
+def _outline(peg: Part, length: float) -> shapely.Polygon:
+    """The outline of a peg's lowest part of a length (m), in its x-y plane: the union of its sections."""
+    top = float(peg.vertices[:, 2].min()) + length - _LEVEL  # a collar that rests on the part is not of it
+    lowest = trimesh.intersections.slice_mesh_plane(peg.mesh, [0.0, 0.0, -1.0], [0.0, 0.0, top])
+    triangles = shapely.polygons(lowest.triangles[..., :2])
+    pieces = shapely.get_parts(shapely.union_all(triangles[shapely.area(triangles) > _SLIVER]))
+    if not len(pieces):
+        raise InputError(f"peg {peg.name!r} has no lower end; give a closed mesh, its tip at the lowest z.")
+    return shapely.Polygon(max(pieces, key=shapely.area).exterior)
 
 
 def depth_reached(hole: Hole, peg: Part, part_from_peg: Array) -> Array:

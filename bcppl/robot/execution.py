@@ -1,7 +1,8 @@
 """A plan while an arm executes it: what is commanded, and where its motions are stopped.
 
 The rules are those of a robot's program: the wrench is read sample by sample, tared, noise and bias included.
-A motion is stopped at the sample after two in a row that exceed its force.
+A motion is stopped at the sample after two in a row that exceed its force. Until the tare is complete the
+first sample stands for it.
 
     executor = Executor(plan, limits=Limits())
     while executor.state == "moving":
@@ -26,9 +27,11 @@ from bcppl.robot.commands import STEP, command_of, continued, interpolated_comma
 from bcppl.robot.plan import Plan
 
 TARE = 10  # samples
+SCATTER = 2.0  # N, root mean square: samples that vary by more are no tare
 SUSTAINED = 2  # samples in a row: an impact is shorter
+ROUNDING = 1e-4  # relative: of speeds, by times that count from 1970
 
-State = Literal["moving", "finished", "in hole", "aborted"]
+State = Literal["moving", "finished", "in hole", "no contact", "aborted"]
 
 
 class Limits(NamedTuple):
@@ -36,8 +39,8 @@ class Limits(NamedTuple):
 
     Attributes:
         force: N, over two samples in a row, at which the plan is aborted.
-        speed: m/s, of motions that may touch: guarded and searching ones.
-        free_speed: m/s, of all others.
+        speed: m/s, of motions that may touch: all but free ones.
+        free_speed: m/s, of free ones.
     """
 
     force: float = 60.0
@@ -50,8 +53,9 @@ class Executor:
 
     Args:
         plan: of the arm.
-        tare: (3,) N, the sensor's reading without contact; by default the mean of the first ten samples,
-            during which no motion is stopped.
+        tare: (3,) N, the sensor's reading without contact; by default the mean of the first ten samples. A
+            plan that does not begin with a free motion, such as the push of an insertion, needs that of the
+            plan before it.
         stop_at_hole: whether the execution ends when a search has found its hole.
         limits: of the arm; None for none.
 
@@ -59,12 +63,16 @@ class Executor:
         probe: the command so far, with the stamps of all samples.
         stops: (s) when each guarded or searching motion was stopped, by its number in the plan.
         contact_pose: (7,) measured when the last guarded motion was stopped; None where none was.
-        state: "aborted" where a limit was exceeded, "in hole" where `stop_at_hole` ended it.
-        reason: of what was aborted, one sentence.
+        tare: (3,) N; None before it is complete.
+        state: "aborted" where a limit was exceeded or the tare is none; "in hole" where `stop_at_hole` ended
+            it, which takes a contact before or, deep in a hole, with its walls; "no contact" where with
+            `stop_at_hole` nothing was felt to the end: the part is elsewhere, or the sensor is dead.
+        reason: of "aborted" and "no contact", one sentence.
 
     Raises:
-        InputError: the plan takes less than the eleven samples by which the wrench is tared, is sampled
-            faster than the command can be changed, or is faster than a limit.
+        InputError: the plan takes less than the eleven samples by which the wrench is tared, does not begin
+            with a free motion and has no tare, is sampled faster than the command can be changed, or is
+            faster than a limit.
     """
 
     def __init__(
@@ -81,6 +89,11 @@ class Executor:
                 f"plan {plan.name!r} has {len(stamps)} samples at {plan.rate:g} Hz; make it longer than "
                 f"{TARE} samples, by which the wrench is tared, at {1.0 / STEP:g} Hz or less."
             )
+        if tare is None and plan.manners[0] != "free":
+            raise InputError(
+                f"plan {plan.name!r} begins with a motion that is {plan.manners[0]}, which allows no tare; "
+                "give the reading without contact as `tare`, or begin with a free motion."
+            )
         if limits is not None:
             _refuse_speed(plan, limits)
         self.plan, self.limits, self.stop_at_hole = plan, limits, stop_at_hole
@@ -89,7 +102,7 @@ class Executor:
         self.contact_pose: Array | None = None
         self.state: State = "moving"
         self.reason = ""
-        self._tare = tare
+        self.tare: Array | None = tare
         self._forces: list[Array] = []  # the first ones and the newest ones, N
         self._held: Array | None = None
         self._motion = np.clip(
@@ -122,21 +135,22 @@ class Executor:
         """
         number, stamps = self.taken, self.probe.stamps
         self._forces.append(np.asarray(force))
-        if number + 1 == len(stamps):
-            self.state = "finished"
         of = int(self._motion[number])
-        if self._exceeds_limit(number):
+        if violation := self._violation():
             self._held = np.asarray(world_from_peg())
             self.state = "aborted"
             self.reason = (
                 f"plan {self.plan.name!r} was aborted at {stamps[number]:.2f} s, in a motion that is "
-                f"{self.plan.manners[of]}: the force exceeded the limit of {self._limit:g} N."
+                f"{self.plan.manners[of]}: {violation}"
             )
             return True
-        if of in self.stops or self.state == "finished":
+        if number + 1 == len(stamps):
+            self._finish()
+        if of in self.stops or self.state != "moving":
             return False
         stopped = self._stops(number, of, world_from_peg)
-        if self.state == "in hole":
+        if stopped and self.stop_at_hole and self.plan.manners[of] == "searching":
+            self.state = "in hole"
             self.stops[of] = float(stamps[number])
             return False
         following = int(self._motion[number + 1])
@@ -146,42 +160,52 @@ class Executor:
         self.probe = continued(self.probe, command_of(self.plan, self.stops), stamps[number + 1])
         return True
 
-    @property
-    def _limit(self) -> float:
-        return np.inf if self.limits is None else self.limits.force
+    def _violation(self) -> str:
+        """What the newest sample violates, a limit or a condition of the tare; empty where nothing."""
+        limit = math.inf if self.limits is None else self.limits.force
+        if self._pressed(limit):
+            return f"the force exceeded the limit of {limit:g} N."
+        if self.tare is not None or self.taken < TARE:
+            return ""
+        rest = np.mean(self._forces, axis=0)
+        scatter = float(np.sqrt(np.square(self._forces - rest).sum(axis=1).mean()))
+        if scatter > SCATTER:
+            return f"the wrench varied by {scatter:.1f} N while it was tared; begin at rest, without contact."
+        if (read := float(np.linalg.norm(rest))) > limit:
+            return f"it was tared at {read:.0f} N, above {limit:g} N; give a `tare` without contact."
+        self.tare = rest
+        return ""
 
-    def _exceeds_limit(self, number: int) -> bool:
-        return np.isfinite(self._limit) and self._pressed(number, self._limit)
+    def _finish(self) -> None:
+        self.state = "finished"
+        if self.stop_at_hole and self.contact_pose is None:
+            self.state = "no contact"
+            self.reason = (
+                f"plan {self.plan.name!r} felt no contact; see that the part is where it is believed to be, "
+                "and that the sensor reads forces."
+            )
 
-    def _pressed(self, number: int, force: float) -> bool:
+    def _pressed(self, force: float) -> bool:
         """Whether the newest samples exceed a force (N), from the reading without contact."""
-        if number < TARE and self._tare is None:
-            return False
-        rest = np.mean(self._forces[:TARE], axis=0) if self._tare is None else self._tare
-        newest = np.array(self._forces[-SUSTAINED:]) - rest
+        newest = np.array(self._forces[-SUSTAINED:]) - (self._forces[0] if self.tare is None else self.tare)
         return len(newest) == SUSTAINED and bool((np.linalg.norm(newest, axis=1) > force).all())
 
     def _stops(self, number: int, of: int, world_from_peg: Callable[[], Array]) -> bool:
         """Whether a motion is to be stopped, after the sample of a number."""
         plan, stamps = self.plan, self.probe.stamps
-        may_guard = number >= TARE or self._tare is not None
-        if plan.manners[of] == "guarded" and stamps[number + 1] < plan.times[of + 1] and may_guard:
-            stopped = self._pressed(number, plan.force)
-            if stopped:
-                self.contact_pose = np.array(world_from_peg())
-            return stopped
-        if plan.manners[of] != "searching" or self._found_before(of):
-            return False
-        stopped = self._sunk(world_from_peg(), float(stamps[number])) > plan.sink
-        if stopped and self.stop_at_hole:
-            self.state = "in hole"
-        return stopped
+        manner, pressed = plan.manners[of], self._pressed(plan.force)
+        guarded = manner == "guarded" and bool(stamps[number + 1] < plan.times[of + 1])
+        if guarded and pressed:
+            self.contact_pose = np.array(world_from_peg())
+        if manner != "searching" or self._found_before(of):
+            return guarded and pressed
+        # A peg that met nothing on its way down, and then something, is between the walls of the hole.
+        return pressed if self.contact_pose is None else self._sunk(world_from_peg(), number) > plan.sink
 
-    def _sunk(self, world_from_peg: Array, time: float) -> float:
-        """How far (m) a peg is below its contact with a surface, along the commanded z; infinite without."""
-        if self.contact_pose is None:
-            return math.inf
-        led = interpolated_command(self.probe, np.array([time]))[0][0]
+    def _sunk(self, world_from_peg: Array, number: int) -> float:
+        """How far (m) a peg is below its contact with a surface, along the commanded z, at a sample."""
+        assert self.contact_pose is not None
+        led = interpolated_command(self.probe, self.probe.stamps[number : number + 1])[0][0]
         along = Rotation.from_quat(led[[4, 5, 6, 3]]).inv()
         return float(along.apply(self.contact_pose[:3] - world_from_peg[:3])[2])
 
@@ -199,8 +223,8 @@ def _refuse_speed(plan: Plan, limits: Limits) -> None:
         number_within(f"the arm's limit of {name} is {{}}", value, above=0.0)
     speeds = np.linalg.norm(np.diff(plan.world_from_peg[:, :3], axis=0), axis=1) / np.diff(plan.times)
     for k, (speed, manner) in enumerate(zip(speeds, plan.manners, strict=True)):
-        limit = limits.speed if manner in ("guarded", "searching") else limits.free_speed
-        if speed > limit * (1.0 + 1e-9):
+        limit = limits.free_speed if manner == "free" else limits.speed
+        if speed > limit * (1.0 + ROUNDING):
             raise InputError(
                 f"motion {k} of plan {plan.name!r} is {manner} at {1e3 * speed:.0f} mm/s, above the arm's "
                 f"limit of {1e3 * limit:.0f}; give it more time, or another limit."

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -12,6 +14,7 @@ from bcppl import poses
 from bcppl.arguments import seed_number
 from bcppl.arrays import Array
 from bcppl.errors import InputError
+from bcppl.robot.description import MOVING, Joint
 from bcppl.robot.kinematics import Robot
 
 NEAR = (0.0005, math.radians(0.5))  # m and rad: tolerance at which a pose is reached
@@ -31,7 +34,7 @@ def joint_paths(
     near: Array | None = None,
     seed: int = 0,
 ) -> Array:
-    """Joint angles along paths of poses, within the joint limits.
+    """Joint angles along paths of poses, within the limits of the joints and of those that mimic them.
 
     Damped least squares (Wampler, Manipulator inverse kinematic solutions based on vector formulations and
     damped least-squares methods, IEEE SMC 16, 1986) from several starts in one batch; each pose of a path is
@@ -51,17 +54,15 @@ def joint_paths(
         (P, K, J) radians, metres where a joint is prismatic; NaN for paths that are not reached.
 
     Raises:
-        InputError: a pose is not valid, the robot has no link of that name, or no joint moves.
+        InputError: a pose is not valid, the robot has no link of that name, no joint moves, or the limits of
+            joints that move together exclude each other.
     """
     seed = seed_number(seed)
     goal = poses.as_pose(torch.as_tensor(base_from_tool), "a path of the tool")
     if not robot.joints:
         raise InputError(f"{robot.name} has no joint that moves {link!r}; name another link.")
     count, length = goal.shape[:2]
-    low, high = (
-        torch.tensor([_within(getattr(j, of)) for j in robot.joints], dtype=torch.float64)
-        for of in ("lower", "upper")
-    )
+    low, high = map(torch.from_numpy, _limits(robot))
     generator = torch.Generator().manual_seed(seed)
     share = torch.rand(_STARTS, len(robot.joints), generator=generator, dtype=torch.float64)
     share[0] = 0.5
@@ -91,9 +92,43 @@ def joint_paths(
     return np.asarray(chosen.numpy())
 
 
-def _within(limit: float) -> float:
-    """A joint limit; without one, a revolution in either direction."""
-    return float(np.clip(limit, -2.0 * math.pi, 2.0 * math.pi))
+class Driven(NamedTuple):
+    """A joint whose value is `factor` times that of the robot's joint number `driver`, plus `constant`."""
+
+    joint: Joint
+    driver: int
+    factor: float
+    constant: float
+
+
+def driven_joints(robot: Robot) -> Iterator[Driven]:
+    """The J joints themselves, of factor 1, and all that mimic one of them, from the base outwards."""
+    number = {joint.name: k for k, joint in enumerate(robot.joints)}
+    joints = {joint.name: joint for joint in map(robot.joint_to, robot.links[1:]) if joint.kind in MOVING}
+    for joint in joints.values():
+        driver, factor, constant = joint, 1.0, 0.0
+        while driver.mimics is not None:
+            name, multiplier, offset = driver.mimics
+            driver, factor, constant = joints[name], factor * multiplier, constant + factor * offset
+        if driver.name in number:
+            yield Driven(joint, number[driver.name], factor, constant)
+
+
+def _limits(robot: Robot) -> tuple[Array, Array]:
+    """The lowest and the highest values (J,) of the joints; without a limit, a revolution either way."""
+    most = 2.0 * math.pi
+    low, high = np.full(len(robot.joints), -most), np.full(len(robot.joints), most)
+    for joint, k, factor, constant in driven_joints(robot):
+        if factor:
+            ends = sorted((limit - constant) / factor for limit in (joint.lower, joint.upper))
+            low[k], high[k] = max(low[k], ends[0]), min(high[k], ends[1])
+    if (low > high).any():
+        name = robot.joints[int(np.argmax(low > high))].name
+        raise InputError(
+            f"no value of joint {name!r} of {robot.name} is within its limits and those of the joints that "
+            "mimic it; correct them in the URDF file."
+        )
+    return low, high
 
 
 def _error(

@@ -198,7 +198,7 @@ class InParts(Protocol):
         """Whether all parts before a measurement are among others, which are in their order."""
 
     def joined(self, first: Measurement, second: Measurement) -> Measurement | None:
-        """Two parts as one, the first where the second adds nothing; None where it does not begin at its end."""
+        """Two parts as one, the first where the second adds nothing; None where they are apart."""
 
     def alone(self, measurement: Measurement) -> Measurement:
         """A part as if there were no other, so that it can be checked by itself."""

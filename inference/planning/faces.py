@@ -17,6 +17,8 @@ from bcppl.geometry.parts import Part
 
 _BELOW = 0.0002  # m below the top at which its outline is taken
 _HOLE = 0.002  # m
+_STRAIGHT = 0.0001  # m by which a side may be bent
+_ON_HULL = 0.0002  # m from its outline: an edge of a section's convex hull is one of its own
 _TRIES = (1.0, 0.75, 0.5, 0.25, 0.0)  # shares of the margin that was asked for
 _CANDIDATES = 60
 _WORTH_A_LIFT = 2.0  # a lift is worth it for a triangle so many times as large
@@ -100,13 +102,26 @@ def points_on_top(part: Part, peg: Part, margin: float) -> TopPoints:
 
 
 def sides(part: Part, height: float) -> list[Side]:
-    """The upright faces that a part's cross section at a height z has on its outside, the longest first."""
-    ring = shapely.geometry.polygon.orient(section(part, height).convex_hull).exterior
-    corners = np.asarray(shapely.simplify(ring, 1e-4).coords)
+    """The upright faces on the outside of a part's cross section at a height z, the longest first.
+
+    They are the stretches of its convex hull's edges that lie on its own outline: across a recess there is
+    nothing to slide along.
+
+    Raises:
+        InputError: the part has no cross section at the height.
+    """
+    outline = section(part, height)
+    near = outline.exterior.buffer(_ON_HULL)
+    ring = shapely.geometry.polygon.orient(outline.convex_hull).exterior
+    corners = np.asarray(shapely.simplify(ring, _STRAIGHT).coords)
     faces = []
     for start, stop in pairwise(corners):
         along = (stop - start) / np.linalg.norm(stop - start)
-        faces.append(Side(start, stop, np.array([along[1], -along[0]])))
+        normal = np.array([along[1], -along[0]])
+        for stretch in shapely.get_parts(shapely.LineString([start, stop]).intersection(near)):
+            ends = np.asarray(stretch.coords)
+            begin, end = ends[np.argsort(ends @ along)][[0, -1]]
+            faces.append(Side(begin, end, normal))
     return sorted(faces, key=lambda side: -side.length)
 
 

@@ -39,8 +39,9 @@ class MetrologyParameters(NamedTuple):
     Attributes:
         first_contact: when it is expected, seconds.
         duration: of the plan, seconds.
-        guarded_speed, free_speed, sliding_speed: m/s, at most; exceeded only as far as the plan would
-            otherwise not end in time.
+        guarded_speed, free_speed, sliding_speed: m/s; exceeded only as far as the plan would otherwise not
+            end in time.
+        haste: by which factor they may be. A plan that needs more keeps to them, and lasts longer.
         slowest_slide: m/s; where there is time to spare, slides are slower, down to this.
         contact_force: newtons that stop a guarded motion.
         press_depth: metres of the command beyond the point of contact: an impact may have stopped it.
@@ -56,6 +57,7 @@ class MetrologyParameters(NamedTuple):
     guarded_speed: float = 0.06
     free_speed: float = 0.25
     sliding_speed: float = 0.09
+    haste: float = 1.25
     slowest_slide: float = 0.02
     contact_force: float = 4.0
     press_depth: float = 0.003
@@ -250,7 +252,10 @@ def _on_top(belief: Belief, points: TopPoints, top: float, parameters: Metrology
 
 
 def _timed(belief: Belief, waypoints: list[Waypoint], peg: Part, parameters: MetrologyParameters) -> Plan:
-    """The plan through waypoints in the part's frame, faster where it would otherwise not end in time."""
+    """The plan through waypoints in the part's frame, faster where it would otherwise not end in time.
+
+    Around a large part haste is not enough: such a plan is slower, and longer.
+    """
     positions = np.stack([waypoint.position for waypoint in waypoints])
     kinds = np.array([waypoint.manner for waypoint in waypoints[1:]])
     guarded = kinds == "guarded"
@@ -262,7 +267,8 @@ def _timed(belief: Belief, waypoints: list[Waypoint], peg: Part, parameters: Met
     first = int(guarded.argmax())
     # Half of the first stroke is over at the first contact; the rest of the plan must fit in the time left.
     after = np.concatenate([[0.5 * spans[first]], spans[first + 1 :]])
-    left = parameters.duration - parameters.first_contact
+    duration = parameters.duration
+    left = duration - parameters.first_contact
     if after.sum() > left:
         strokes = guarded[first:]
         slow = after[strokes].sum()
@@ -270,9 +276,12 @@ def _timed(belief: Belief, waypoints: list[Waypoint], peg: Part, parameters: Met
             shrink = np.where(strokes, 1.0, (left - slow) / after[~strokes].sum())
         else:
             shrink = np.full(len(after), left / after.sum())
-        spans[first:] *= shrink
+        if parameters.haste * shrink.min() >= 1.0:
+            spans[first:] *= shrink
+        else:
+            duration = parameters.first_contact + after.sum()
     begin = parameters.first_contact - spans[:first].sum() - 0.5 * spans[first]
-    spare = parameters.duration - (begin + spans.sum())
+    spare = duration - (begin + spans.sum())
     slides = (kinds == "held") & (lengths > 1.01 * parameters.press_depth)
     if spare > 0.0 and slides.any():  # slower slides are more informative
         slower = np.minimum(spans * (1.0 + spare / spans[slides].sum()), lengths / parameters.slowest_slide)
@@ -280,8 +289,8 @@ def _timed(belief: Belief, waypoints: list[Waypoint], peg: Part, parameters: Met
     times = np.concatenate([[0.0], begin + np.concatenate([[0.0], np.cumsum(spans)])])
     path = leaning(belief, [waypoints[0], *waypoints], tip_of(peg))
     manners: tuple[Manner, ...] = ("free", *(waypoint.manner for waypoint in waypoints[1:]))
-    if times[-1] < parameters.duration - 1e-6:
-        times = np.append(times, parameters.duration)
+    if times[-1] < duration - 1e-6:
+        times = np.append(times, duration)
         path, manners = np.concatenate([path, path[-1:]]), (*manners, "held")
     return Plan(
         "3-2-1",

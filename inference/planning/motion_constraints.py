@@ -17,11 +17,14 @@ from bcppl.geometry.parts import Part
 from bcppl.inference.planning.constraints import Constraint, per_candidate
 from bcppl.inference.planning.motions import expected_contacts, free_path, pressing_force
 from bcppl.robot.arm_with_peg import ArmWithPeg
+from bcppl.robot.commands import interpolated_command
 from bcppl.robot.inverse_kinematics import joint_paths
-from bcppl.robot.plan import Plan
+from bcppl.robot.plan import Plan, probe_of
 from bcppl.sensors.candidates import Candidate, duration_of, motion_of, placement_of
 
 _CONTACT = 0.0005  # m: a peg so near to the part is in contact with it
+_FROM_BELOW = math.radians(120.0)  # of a direction to that straight from above
+_SHIFT, _TURN = 0.02, math.radians(10.0)  # m and rad between the poses at which reach is asked for
 
 
 def approach_within(direction: Sequence[float], angle: float, violation: str = "") -> Constraint:
@@ -55,8 +58,26 @@ def approach_within(direction: Sequence[float], angle: float, violation: str = "
 
 
 def not_from_below() -> Constraint:
-    """Touches and views approach from above or from the side, at most 30 degrees from below."""
-    return approach_within((0.0, 0.0, -1.0), math.radians(120.0), "come from below")
+    """Touches, views and hands come from above or from the side, at most 30 degrees from below.
+
+    The hand is at the end of the peg's axis, so that axis is within 120 degrees of up all along a plan.
+    """
+    approach = approach_within((0.0, 0.0, -1.0), _FROM_BELOW, "come from below")
+
+    def is_held_from_above(candidate: Candidate) -> bool:
+        motion = motion_of(candidate)
+        if motion is None:
+            return True
+        up = poses.rotation_matrix(torch.from_numpy(motion.world_from_peg))[:, 2, 2]
+        return bool((up > math.cos(_FROM_BELOW) - 1e-9).all())
+
+    def satisfied(candidates: Sequence[Candidate]) -> list[bool]:
+        return [
+            approaches and is_held_from_above(candidate)
+            for candidate, approaches in zip(candidates, approach.satisfied(candidates), strict=True)
+        ]
+
+    return Constraint(approach.violation, satisfied)
 
 
 def collision_free(gap: PegGap, world_from_part: Array | torch.Tensor) -> Constraint:
@@ -132,7 +153,8 @@ def force_at_most(force: float) -> Constraint:
 def within_reach(arm: ArmWithPeg, *, seed: int = 0) -> Constraint:
     """The arm's joints can follow plans, and place a camera on the wrist at views' poses.
 
-    Cameras that are not on the wrist satisfy it. See `bcppl.robot.inverse_kinematics.joint_paths`.
+    Plans are followed at poses at most 20 mm and 10 degrees apart. Cameras that are not on the wrist satisfy
+    it. See `bcppl.robot.inverse_kinematics.joint_paths`.
     """
     base_from_world = poses.inverse(torch.as_tensor(arm.world_from_base))
 
@@ -143,7 +165,7 @@ def within_reach(arm: ArmWithPeg, *, seed: int = 0) -> Constraint:
         for k, candidate in enumerate(candidates):
             motion, placement = motion_of(candidate), placement_of(candidate)
             if motion is not None:
-                paths[k] = _distinct(motion.world_from_peg)
+                paths[k] = _followed(motion)
                 groups.setdefault(len(paths[k]), []).append(k)
             if placement is not None and placement.wrist_from_sensor is not None:
                 wrist = poses.compose(
@@ -162,7 +184,13 @@ def within_reach(arm: ArmWithPeg, *, seed: int = 0) -> Constraint:
     return Constraint(f"are out of {arm.robot.name}'s reach", satisfied)
 
 
-def _distinct(world_from_peg: Array) -> Array:
-    """The poses of a path without those at which the peg rests."""
-    moves = np.abs(np.diff(world_from_peg, axis=0)).max(axis=1) > 1e-9
-    return world_from_peg[np.concatenate([[True], moves])]
+def _followed(plan: Plan) -> Array:
+    """Poses (M, 7) along a plan's path, without those at which the peg rests."""
+    knots = torch.from_numpy(plan.world_from_peg)
+    away = poses.local(knots[:-1], knots[1:])
+    parts = torch.maximum(away[:, :3].norm(dim=1) / _SHIFT, away[:, 3:].norm(dim=1) / _TURN)
+    ends = np.append(0.0, np.cumsum(np.maximum(1.0, np.ceil(parts.numpy()))))
+    times = np.interp(np.arange(ends[-1] + 1.0), ends, plan.times)
+    path, _ = interpolated_command(probe_of(plan), times)
+    moves = np.abs(np.diff(path, axis=0)).max(axis=1) > 1e-9
+    return path[np.concatenate([[True], moves])]

@@ -58,7 +58,7 @@ def success_probability(
         belief: over world_from_part.
         plan: from `insertion_plan`, for this belief or another.
         physics: of the part and the peg.
-        hole: of the part; `hole_of(part)` unless given.
+        hole: of the part; `hole_of(part, peg=peg)` unless given.
         particles: how many are drawn from the belief by weight and simulated; fewer if it has fewer.
         seed: of that draw.
 
@@ -67,7 +67,7 @@ def success_probability(
             positive.
     """
     whole_number("the success of an insertion is to be simulated for {} particles", particles)
-    hole = hole_of(physics.part) if hole is None else hole
+    hole = hole_of(physics.part, peg=physics.peg) if hole is None else hole
     beginning = plan.search.world_from_peg[0]
     world_from_part = _draw(belief.relative(beginning), particles, seed)
     count = len(world_from_part)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -13,6 +14,7 @@ from bcppl.arrays import Array
 from bcppl.beliefs import Belief
 from bcppl.geometry.parts import Part
 from bcppl.robot.plan import Manner
+from bcppl.sensors.plausibility.pegs import peg_doubt
 
 if TYPE_CHECKING:
     from bcppl.inference.planning.metrology import MetrologyParameters
@@ -87,5 +89,8 @@ def top_of(part: Part) -> float:
 
 
 def tip_of(peg: Part) -> float:
-    """The height z of a peg's tip in its frame, metres."""
+    """The height z of a peg's tip in its frame, metres: of its lowest end, with a warning if that is none."""
+    for doubt in peg_doubt(peg):
+        # At this line for all planners, so that Python shows it once.
+        warnings.warn(doubt, RuntimeWarning, stacklevel=1)
     return float(peg.vertices[:, 2].min())

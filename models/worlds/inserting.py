@@ -28,7 +28,7 @@ class InsertionResult(NamedTuple):
         inserted: whether the peg ended in the hole, at least 0.8 of its depth or 10 mm beyond its chamfer
             below the top of the part.
         found_at: when (s) the search ended because the peg sank in; NaN where it did not. The push follows
-            all the same, and may still succeed.
+            all the same, and may still succeed, unless the search felt no contact at all.
         depth: of the tip below the top at the end, metres.
         peak_force: the largest force on the peg at a sample, N.
         sustained_force: the largest force on the peg over two samples in a row, N: an impact is shorter.
@@ -71,28 +71,31 @@ def insert(
     search = execute(
         plan.search, part, peg, contact, world_from_part, error, stop_at_hole=True, reality=reality
     )
-    done = len(search.wrench)
-    tare = (search.felt[:TARE, :3] + error[:TARE, :3]).mean(axis=0)
-    last = torch.from_numpy(search.encoders[-1])
-    measured = poses.retract(last, torch.from_numpy(pose_error[done - 1]))
-    push = execute(
-        plan.push_from(measured.numpy(), _below(search.contact_pose, measured)),
-        part,
-        peg,
-        contact,
-        world_from_part,
-        error[done:],
-        after=search,
-        tare=tare,
-        reality=reality,
-    )
+    searched = [t for k, t in search.stops.items() if plan.search.manners[k] == "searching"]
+    executed = [search]
+    if searched or search.contact_pose is not None:
+        done = len(search.wrench)
+        tare = (search.felt[:TARE, :3] + error[:TARE, :3]).mean(axis=0)
+        last = torch.from_numpy(search.encoders[-1])
+        measured = poses.retract(last, torch.from_numpy(pose_error[done - 1]))
+        push = execute(
+            plan.push_from(measured.numpy(), _below(search.contact_pose, measured)),
+            part,
+            peg,
+            contact,
+            world_from_part,
+            error[done:],
+            after=search,
+            tare=tare,
+            reality=reality,
+        )
+        executed.append(push)
     world_from_hole = poses.compose(torch.from_numpy(reality.part_at()), torch.from_numpy(part_from_hole))
     tip = torch.tensor([[0.0, 0.0, float(peg.vertices[:, 2].min())]], dtype=torch.float64)
-    end = poses.transform(torch.from_numpy(push.world_from_peg[-1]), tip)
+    end = poses.transform(torch.from_numpy(executed[-1].world_from_peg[-1]), tip)
     in_hole = poses.transform(poses.inverse(world_from_hole), end)[0]
     depth, beside = -float(in_hole[2]), float(in_hole[:2].norm())
-    force = np.linalg.norm(np.concatenate([search.wrench, push.wrench])[:, :3], axis=1)
-    searched = [t for k, t in search.stops.items() if plan.search.manners[k] == "searching"]
+    force = np.linalg.norm(np.concatenate([each.wrench for each in executed])[:, :3], axis=1)
     return InsertionResult(
         inserted=bool(depth >= plan.deep_enough and beside < _BESIDE),
         found_at=searched[0] if searched else math.nan,

@@ -54,6 +54,7 @@ def arm(
         laplace_proposal,
         observations,
         remaining_error,
+        require_sockets,
     )
     from bcppl.recordings.hdf5 import replacing
     from bcppl.robot.correction import corrected
@@ -67,6 +68,7 @@ def arm(
         )
     settings = profile_tree(profile)
     seatings = _seatings(folder)
+    require_sockets(seatings)
     console = Console(highlight=False)
     if len(seatings) < SEATED:
         console.print(
@@ -82,12 +84,12 @@ def arm(
             arm_calibration, (model, seatings), observations(seatings), particles, proposal
         )
     draws = population.trace, normalised(population.log_weights)
-    left = remaining_error(model, *draws, seatings)
-    text = corrected(urdf, corrected_joints(model, *draws))
+    with replacing(files[0]) as beside:
+        beside.write_text(corrected(urdf, corrected_joints(model, *draws)), encoding="utf-8")
+    left = remaining_error(model, Robot(files[0], tip=link), *draws, seatings)
     settings["kinematics"] = [left.deviation, left.length]
-    for file, content in zip(files, (text, json.dumps(settings, indent=1) + "\n"), strict=True):
-        with replacing(file) as beside:
-            beside.write_text(content, encoding="utf-8")
+    with replacing(files[1]) as beside:
+        beside.write_text(json.dumps(settings, indent=1) + "\n", encoding="utf-8")
     console.print(
         f"the seated ball scattered by {1e3 * left.before:.2f} mm by the nominal arm and by "
         f"{1e3 * left.after:.2f} mm by the calibrated one (effective draws: "

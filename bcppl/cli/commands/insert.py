@@ -9,18 +9,32 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from bcppl.arguments import LARGEST_SEED
-from bcppl.cli.options import AsJson, Given, InferenceName, ModelName, Of, Particles, Settings
+from bcppl.cli.options import (
+    AsJson,
+    Given,
+    InferenceName,
+    Link,
+    LinkFromPeg,
+    ModelName,
+    Of,
+    Particles,
+    Settings,
+    WorldFromBase,
+)
 from bcppl.cli.outputs import refuse_overwriting
 from bcppl.errors import InputError
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from bcppl.arrays import Array
-    from bcppl.beliefs import Belief
     from bcppl.geometry.parts import Part
+    from bcppl.inference.planning.constraints import Constraint
     from bcppl.recordings import Recording
-    from bcppl.robot.plan import InsertionPlan
+    from bcppl.robot.plan import InsertionPlan, Plan
 
 SIX = "x0 y0 z0 x1 y1 z1"
+SURE = 0.95  # a mode with less of the belief's weight is one of several
 
 
 def insert(
@@ -36,6 +50,12 @@ def insert(
         str | None,
         typer.Option(help=f"Corners of the box (m, in the world) that the peg's tip may not leave: {SIX}."),
     ] = None,
+    inside: Annotated[
+        str | None,
+        typer.Option(
+            help="A point (m) in the hole, in the part's frame; needed where there are several: x y."
+        ),
+    ] = None,
     simulations: Annotated[
         int, typer.Option(min=0, help="How many particles the chance is simulated for; 0 for none.")
     ] = 24,
@@ -45,15 +65,24 @@ def insert(
     inference: InferenceName = None,
     particles: Particles = 75,
     seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Same seed, same plan.")] = 0,
+    robot: Annotated[
+        str | None,
+        typer.Option(help="An arm (panda, iiwa or a URDF file): what it cannot follow is refused."),
+    ] = None,
+    link: Link = None,
+    link_from_peg: LinkFromPeg = None,
+    world_from_base: WorldFromBase = None,
     as_json: AsJson = False,
 ) -> None:
     """Plan an insertion where the hole is believed to be, and say how probable it is to succeed."""
     from rich.console import Console
 
     from bcppl.cli import loading
+    from bcppl.cli.candidates import reach
     from bcppl.cli.posterior import posterior
     from bcppl.contact.physics import PegPhysics
-    from bcppl.inference.planning.insertion import InsertionParameters, insertion_plan
+    from bcppl.geometry.holes import fit_in, hole_of
+    from bcppl.inference.planning.insertion import InsertionParameters, hole_estimate, insertion_plan
     from bcppl.inference.planning.success import success_probability
     from bcppl.recordings.action_file import SUFFIXES, save_actions
 
@@ -61,6 +90,8 @@ def insert(
         raise InputError(f"--output is {output}; give a file that ends in {' or '.join(SUFFIXES)}.")
     refuse_overwriting("--output", output, recording, of, model, inference)
     box = None if workspace is None else _box(workspace)
+    point = None if inside is None else _numbers("--inside", inside, "two", "x y")
+    constraints = reach(robot, link, link_from_peg, world_from_base, seed)
     console = Console(highlight=False, stderr=as_json)
     found: dict[str, Any] = {"output": str(output)}
     now = posterior(
@@ -69,31 +100,41 @@ def insert(
     belief, part, peg = now.population.belief(now.model.pose), now.recording.part, now.recording.peg
     assert peg is not None
     usual = InsertionParameters()
-    # The press before the search is twice as fast as the landing, and a long spiral as the search.
     careful = usual._replace(
-        landing_speed=min(usual.landing_speed, 0.5 * speed),
-        search_speed=min(usual.search_speed, 0.5 * speed),
+        landing_speed=min(usual.landing_speed, 0.5 * speed),  # the press before the search is twice as fast
+        search_speed=min(usual.search_speed, speed),
         push_speed=min(usual.push_speed, speed),
         push_force=force,
         contact_force=min(usual.contact_force, force),
     )
-    plan = insertion_plan(belief, part, peg, parameters=careful)
+    hole = hole_of(part, None if point is None else (point[0], point[1]), peg)
+    plan = insertion_plan(belief, part, peg, hole, careful)
     if box is not None:
         _refuse_outside(plan, peg, box)
+    _refuse_out_of_reach(plan, constraints)
     save_actions([plan.search, plan.push], output)
-    deviation = _deviation(belief, plan)
-    place = 1e3 * plan.world_from_hole[:3]
-    found |= {"world_from_hole": plan.world_from_hole.tolist(), "deviation_mm": deviation}
+    mass, world_from_hole, covariance = hole_estimate(belief, hole, fit_in(hole, peg))
+    place, deviation = 1e3 * world_from_hole[:3], _deviation(covariance)
+    found |= {"world_from_hole": world_from_hole.tolist(), "deviation_mm": deviation, "mass": mass}
     console.print(
         f"the hole is at {place[0]:.2f} {place[1]:.2f} {place[2]:.2f} mm, sure to {deviation[0]:.2f} mm "
         f"across and {deviation[1]:.2f} mm along its axis (standard deviations, relative to the peg)."
     )
+    if mass < SURE:
+        console.print(
+            f"this is the heaviest of several modes of the belief, with {100.0 * mass:.0f} % of its weight; "
+            "touch or look once more before you try it (bcppl probe)."
+        )
     seconds = sum(float(each.times[-1] - each.times[0]) for each in (plan.search, plan.push))
-    console.print(f"search and push take {seconds:.1f} s at most; a push of {force:g} N ends it.")
+    found |= {"reach_mm": (reached := _reach(plan.search))}
+    console.print(
+        f"search and push take {seconds:.1f} s at most; the search goes {reached:.2f} mm far, and a push of "
+        f"{force:g} N ends it."
+    )
     if simulations:
         with console.status("simulating"):
             chance = success_probability(
-                belief, plan, PegPhysics(part, peg), particles=simulations, seed=seed
+                belief, plan, PegPhysics(part, peg), hole, particles=simulations, seed=seed
             )
         found |= chance._asdict()
         console.print(
@@ -113,15 +154,23 @@ def _refuse(recording: Recording) -> None:
 
 def _box(words: str) -> Array:
     """The lowest and the highest corner (2, 3) of a box, m."""
+    corners = _numbers("--workspace", words, "six", SIX).reshape(2, 3)
+    if not (corners[0] < corners[1]).all():
+        raise InputError(f"--workspace is {words[:60]!r}; give the lowest corner, then the highest: {SIX}.")
+    return corners
+
+
+def _numbers(option: str, words: str, count: str, names: str) -> Array:
+    """The numbers of an option, as many as it has names."""
     import numpy as np
 
     try:
-        corners = np.array([float(word) for word in words.replace(",", " ").split()]).reshape(2, 3)
-    except ValueError as error:
-        raise InputError(f"--workspace is {words[:60]!r}; give six numbers in metres: {SIX}.") from error
-    if not (np.isfinite(corners).all() and (corners[0] < corners[1]).all()):
-        raise InputError(f"--workspace is {words[:60]!r}; give the lowest corner, then the highest: {SIX}.")
-    return corners
+        numbers = np.array([float(word) for word in words.replace(",", " ").split()])
+    except ValueError:
+        numbers = np.empty(0)
+    if len(numbers) != len(names.split()) or not np.isfinite(numbers).all():
+        raise InputError(f"{option} is {words[:60]!r}; give {count} numbers in metres: {names}.")
+    return numbers
 
 
 def _refuse_outside(plan: InsertionPlan, peg: Part, box: Array) -> None:
@@ -143,15 +192,28 @@ def _refuse_outside(plan: InsertionPlan, peg: Part, box: Array) -> None:
             )
 
 
-def _deviation(belief: Belief, plan: InsertionPlan) -> tuple[float, float]:
-    """Standard deviations of the hole's position as seen from the peg, mm: the larger across, and along."""
+def _refuse_out_of_reach(plan: InsertionPlan, constraints: list[Constraint]) -> None:
+    """Refuse a plan that an arm cannot follow without changing its configuration."""
+    for each in (plan.search, plan.push):
+        for constraint in constraints:
+            if not constraint.satisfied([each])[0]:
+                raise InputError(
+                    f"poses of the {each.name} {constraint.violation}; move the part or the arm's base, or "
+                    "check --link-from-peg and --world-from-base."
+                )
+
+
+def _reach(search: Plan) -> float:
+    """How far from the expected place a search goes, mm."""
+    import numpy as np
+
+    path = search.world_from_peg[search.manners.index("searching") :, :3]
+    return 1e3 * float(np.linalg.norm(path - path[0], axis=1).max())
+
+
+def _deviation(covariance: Tensor) -> tuple[float, float]:
+    """Standard deviations of the hole's position, mm: the larger across its axis, and along it."""
     import torch
 
-    from bcppl import poses
-
-    seen = belief.relative(torch.from_numpy(plan.push.world_from_peg[0]))
-    hole = torch.from_numpy(plan.world_from_hole)
-    turn = poses.rotation_matrix(hole)
-    covariance = turn.T @ seen.covariance[:3, :3] @ turn
     across = torch.linalg.eigvalsh(covariance[:2, :2]).max()
-    return 1e3 * float(across.sqrt()), 1e3 * float(covariance[2, 2].clamp(min=0.0).sqrt())
+    return 1e3 * float(across.sqrt()), 1e3 * float(covariance[2, 2].sqrt())

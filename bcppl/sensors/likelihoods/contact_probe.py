@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache, partial
 
 import pyro
@@ -67,6 +67,8 @@ class TouchSettings:
         delay: standard deviation of the time between the wrench's stamps and the pose's, s.
         gap_outlier: probability that a stamp without contact, or a contact, is an outlier.
         contact_detector: force thresholds of contact and of free motion.
+        tool_mass: kg, of all that the wrench sensor carries; by default `contact_detector`'s mass, 0.3 kg. A
+            heavy tool that accelerates is felt as a contact unless its mass is stated.
         free_space: whether stamps without contact count, which exclude the part from where the peg moved.
         profile: of the bench, which sets the priors of the errors that all touches share
             (`bcppl.sensors.likelihoods.bench_profiles`).
@@ -82,6 +84,7 @@ class TouchSettings:
     delay: float = field(default=0.002, metadata=NONNEGATIVE)
     gap_outlier: float = field(default=0.001, metadata=PROBABILITY)
     contact_detector: ContactDetector = field(default_factory=ContactDetector)
+    tool_mass: float | None = field(default=None, metadata=within(least=0.0, optional=True))
     free_space: bool = True
     profile: str = "ur5e"
     bench: tuple[LinearError, ...] | None = None
@@ -96,6 +99,8 @@ class TouchSettings:
             )
         if self.bench is not None:
             object.__setattr__(self, "bench", LinearErrors(self.bench).errors)
+        if self.tool_mass is not None:
+            object.__setattr__(self, "contact_detector", replace(self.contact_detector, mass=self.tool_mass))
 
 
 MakesGap = Callable[[Part, Part], PegGap]

@@ -6,9 +6,8 @@ import math
 from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import lru_cache, partial
 
-import numpy as np
 import pyro
 import pyro.distributions as dist
 from torch import Tensor
@@ -22,7 +21,9 @@ from bcppl.distributions.contact import ChamferContacts, ContactsInTime, PegPose
 from bcppl.distributions.parameters import COUNT, NONNEGATIVE, POSITIVE, check_parameters, within
 from bcppl.effort import Effort
 from bcppl.errors import InputError
-from bcppl.robot.motion import ProbeWindow
+from bcppl.geometry.parts import Part
+from bcppl.robot.motion import Probe, ProbeWindow
+from bcppl.sensors.likelihoods.probe_rows import step_of
 from bcppl.sensors.measurements import Recording
 from bcppl.sensors.scene import Numbered, by_probe
 from bcppl.traces.carried import carried, once
@@ -31,6 +32,8 @@ from bcppl.traces.carried import carried, once
 CONTACT = ContactParameters(time_step=0.004, friction=0.3, time_constant=0.008)
 MEDIAN_AND_SPREAD = within(above=0.0, count=2, optional=True)
 EVIDENCE = ("contacts", "contacts in time", "pose", "gaps", "wrench")
+_CUTOFF = 20.0  # Hz, of the wrench's filter before contact is located
+_SAME_RATE = 0.02  # of a rate: as `ContactSensing.check_rate` has it
 
 
 @dataclass(frozen=True)
@@ -89,6 +92,13 @@ class ProbeSettings:
             )
 
 
+@lru_cache(maxsize=16)
+def _sensing(peg: Part, rate: float, is_located: bool) -> ContactSensing:
+    """Contact sensing at a rate (Hz), with a filter where contact is located and the rate allows one."""
+    cutoff = _CUTOFF if is_located and 0.5 * rate > _CUTOFF else None
+    return ContactSensing(peg, rate=rate, cutoff=cutoff)
+
+
 class SimulatedProbe:
     """Windows of a probe, simulated for every pose of the part; windows of one probe share one rollout.
 
@@ -106,14 +116,15 @@ class SimulatedProbe:
 
     nuisances: Nuisances | None
 
+    nuisance_addresses = ("friction", "time_constant")
+
     def __init__(self, recording: Recording, settings: ProbeSettings) -> None:
         if recording.peg is None:
             raise InputError("the recording has probe windows but no peg; add the peg that was held.")
         windows = [m.action for m in recording.measurements if isinstance(m.action, ProbeWindow)]
         self.settings, self.nuisances = settings, None
         self.physics = PegPhysics(recording.part, recording.peg, settings.contact)
-        rate = 1.0 / float(np.median(np.diff(windows[0].probe.stamps)))
-        self.sensing = ContactSensing(recording.peg, rate=rate)
+        self._rates = tuple(dict.fromkeys(1.0 / step_of(window.probe) for window in windows))
 
     @property
     def efforts(self) -> Mapping[str, Effort]:
@@ -130,6 +141,13 @@ class SimulatedProbe:
         other.nuisances = nuisances
         return other
 
+    def sensing(self, probe: Probe) -> ContactSensing:
+        """Contact sensing for a probe; one for all whose rates agree with one in the recording."""
+        own = 1.0 / step_of(probe)
+        rate = next((each for each in self._rates if abs(own / each - 1.0) <= _SAME_RATE), own)
+        is_located = bool({"contacts", "contacts in time"} & set(self.settings.evidence))
+        return _sensing(self.physics.peg, rate, is_located)
+
     def rollout(
         self, action: ProbeWindow, world_from_part: Tensor, latent: Mapping[str, Tensor] | None = None
     ) -> ProbeRollout:
@@ -141,7 +159,8 @@ class SimulatedProbe:
         if latent:
             nuisances = replace(nuisances or Nuisances(), **latent)
         own = () if nuisances is None else (nuisances,)
-        begin = partial(ProbeRollout.start, self.physics, self.sensing, world_from_part, action.probe, *own)
+        sensing = self.sensing(action.probe)
+        begin = partial(ProbeRollout.start, self.physics, sensing, world_from_part, action.probe, *own)
         return carried(f"probe {action.probe.name}", begin)
 
     def observe(self, number: int, action: ProbeWindow, world_from_part: Tensor) -> None:
@@ -166,7 +185,7 @@ class SimulatedProbe:
 
     def _latent(self) -> Mapping[str, Tensor]:
         known: dict[str, Tensor] = once("parameters of the contact", dict)
-        for name in ("friction", "time_constant"):
+        for name in self.nuisance_addresses:
             prior = getattr(self.settings, name)
             if prior is not None and name not in known:
                 known[name] = pyro.sample(name, dist.LogNormal(math.log(prior[0]), prior[1]))
@@ -177,8 +196,9 @@ class SimulatedProbe:
         evidence, values = self.settings.evidence, dict[str, Tensor]()
         for windows in by_probe(measurements):
             touches = [measurement.observation for _, measurement in windows]
-            tared = self.sensing.tared(touches) if "wrench" in evidence else touches
-            read = zip(windows, self.sensing.measure(touches), tared, strict=True)
+            sensing = self.sensing(windows[0].measurement.action.probe)
+            tared = sensing.tared(touches) if "wrench" in evidence else touches
+            read = zip(windows, sensing.measure(touches), tared, strict=True)
             for (number, _), (contacts, peg), wrench in read:
                 each = {"contacts": contacts, "contacts in time": contacts, "pose": peg, "wrench": wrench}
                 for kind in each.keys() & set(evidence):

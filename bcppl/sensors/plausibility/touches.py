@@ -18,8 +18,9 @@ from bcppl.sensors import checks
 from bcppl.sensors.measurements import Measurement
 from bcppl.sensors.plausibility.contacts import Contacts, Felt, Met, along_axis, felt_by
 from bcppl.sensors.plausibility.images import reordered
+from bcppl.sensors.plausibility.pegs import peg_doubt
 from bcppl.sensors.plausibility.search import Found, is_narrow
-from bcppl.sensors.plausibility.units import FEWEST, command_doubt, in_newtons
+from bcppl.sensors.plausibility.units import FEWEST, command_doubt, in_newtons, zero_doubt
 from bcppl.sensors.plausibility.wording import of_probes
 
 TOUCHING = 0.004  # m: gaps up to which a felt contact is one with the part
@@ -78,14 +79,16 @@ def touch_doubts(
         return []
     probes = felt_by([m for m in measurements if _is_readable(m)])
     by_cause: dict[str, list[str]] = {}
-    scaled = []
+    touching = []
     for felt in probes:
         in_units, causes = in_newtons(felt, peg)
-        scaled.append(in_units)
-        for cause in [*causes, *command_doubt(felt)]:
+        tared = list(zero_doubt(in_units))
+        for cause in [*causes, *tared, *command_doubt(felt)]:
             by_cause.setdefault(cause, []).append(felt.probe.name)
-    lines = [f"{of_probes(names)} has {cause}." for cause, names in by_cause.items()]
-    touching = [felt for felt in scaled if felt.contact.sum() >= FEWEST]
+        # By a wrench that is tared in contact, where the peg is free it seems to touch.
+        if not tared and in_units.contact.sum() >= FEWEST:
+            touching.append(in_units)
+    lines = [*peg_doubt(peg), *(f"{of_probes(names)} has {cause}." for cause, names in by_cause.items())]
     if touching and is_narrow(guess):
         try:
             lines += _of_contacts(Contacts(part, peg, guess), touching, start)

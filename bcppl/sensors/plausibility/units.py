@@ -1,4 +1,4 @@
-"""Doubts about a probe's own numbers, without the part: units of wrenches, and the command."""
+"""Doubts about a probe's own numbers, without the part: units of wrenches, their zero, and the command."""
 
 from __future__ import annotations
 
@@ -8,12 +8,15 @@ from dataclasses import replace
 import numpy as np
 
 from bcppl.geometry.parts import Part
-from bcppl.sensors.plausibility.contacts import Felt
+from bcppl.sensors.plausibility.contacts import LEAST, ZERO, Felt
 
 FAINTEST, STRONGEST = 0.3, 1000.0  # N: the largest force of a probe that meets something is between
 CLEAR = 20.0  # times the noise: a contact, whatever the unit
 LONGEST, SHORTEST = 10.0, 0.002  # reaches of the peg: the median lever of its contacts is between
 STILL, MOVED = 0.001, 0.005  # m: a command that stands still, a peg that moves
+LEFT = 0.005  # m from where it began: the peg has left, and retreats over as much again
+STEADY = 0.3  # of a force: by so much it may vary
+AGAINST = 0.7  # the least cosine between a retreat and the force that it seems to overcome
 FEWEST = 10  # stamps in contact, below which they decide nothing
 
 
@@ -57,6 +60,29 @@ def in_newtons(felt: Felt, peg: Part) -> tuple[Felt, list[str]]:
         first, second = f"{first}, and torques too", ""
     scaled = replace(scaled, wrench=scaled.wrench * ([1.0] * 3 + [torque] * 3))
     return scaled, [words for words in (first, second) if words]
+
+
+def zero_doubt(felt: Felt) -> Iterator[str]:
+    """The mistake in words where a probe begins in contact, so that its wrench is tared by a contact.
+
+    Then that contact's force, reversed, is felt from when the peg leaves the surface, against it, until the
+    end. A surface that is met later is not felt as early, and one that is slid on does not oppose the motion.
+    """
+    away = np.linalg.norm(felt.pose[:, :3] - felt.pose[0, :3], axis=1)
+    if away.max() < 2.0 * LEFT:
+        return
+    leaving = slice(int((away > LEFT).argmax()), int((away >= 2.0 * LEFT).argmax()) + 1)
+    force = felt.force
+    stays = force[-ZERO:].mean(axis=0)
+    size = float(np.linalg.norm(stays))
+    off = np.linalg.norm(np.concatenate([force[leaving], force[-ZERO:]]) - stays, axis=1)
+    retreat = felt.pose[leaving.stop - 1, :3] - felt.pose[leaving.start, :3]
+    against = -float(retreat @ stays) > AGAINST * size * float(np.linalg.norm(retreat))
+    if against and size > LEAST and np.quantile(off, 0.9) < STEADY * size:
+        yield (
+            f"a force of {size:.1f} N that stays when the peg has left where it began: probably it begins in "
+            "contact, and the mean of its first rows is no zero of the sensor; record from before the contact"
+        )
 
 
 def command_doubt(felt: Felt) -> Iterator[str]:

@@ -1,0 +1,77 @@
+"""Holes and pegs that are not prisms: drilled, stepped, conical, chamfered; and how deep a peg goes in."""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import numpy as np
+import pytest
+import trimesh
+
+from bcppl.errors import InputError
+from bcppl.geometry.extrusion import block_with_hole, peg_for
+from bcppl.geometry.holes import fit_in, hole_of
+from bcppl.geometry.outlines import round_outline
+from bcppl.geometry.parts import Part
+
+RADIUS = 0.005
+SIDES = 64
+
+
+def turned(name: str, *profile: tuple[float, float]) -> Part:
+    """The solid of revolution of a profile of radii and heights, metres."""
+    mesh = trimesh.creation.revolve(np.array(profile), sections=SIDES)
+    mesh.merge_vertices()
+    mesh.fix_normals()
+    part = Part(name, np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    part.check()
+    return part
+
+
+def drilled(*bottom: tuple[float, float]) -> Part:
+    """A disc, 30 mm high, with a hole of 10 mm whose bottom has a profile."""
+    lowest = (bottom[0][0], -0.03) if bottom[0][0] > 0.0 else (0.0, -0.03)
+    closing = (bottom[0],) if bottom[0][0] > 0.0 else ()
+    return turned("disc", *bottom, (RADIUS, 0.0), (0.03, 0.0), (0.03, -0.03), lowest, *closing)
+
+
+@functools.cache
+def pin(diameter: float) -> Part:
+    return peg_for(round_outline(diameter), 0.0002, 0.08, f"pin for {1000.0 * diameter:g} mm")
+
+
+def coned(shank: float, length: float, tip: float = 0.0, whole: float = 0.08) -> Part:
+    """A peg whose shank (m) narrows over the lowest length (m) of it to the diameter of its tip (m)."""
+    flat = ((0.5 * tip, -whole),) if tip else ()
+    return turned("cone", (0.0, -whole), *flat, (0.5 * shank, length - whole), (0.5 * shank, 0.0), (0.0, 0.0))
+
+
+def test_a_drilled_hole_ends_where_its_point_begins() -> None:
+    point = RADIUS / math.tan(math.radians(59.0))
+    part = drilled((0.0, -0.015 - point), (RADIUS, -0.015))
+    hole = hole_of(part, peg=pin(0.010))
+    assert hole.depth == pytest.approx(0.015) and hole.chamfer == 0.0 and not hole.through
+    assert fit_in(hole, pin(0.010)).clearance == pytest.approx(0.0002, abs=2e-5)
+
+
+def test_a_counterbore_is_a_hole_for_a_wide_peg_and_a_chamfer_for_a_narrow_one() -> None:
+    part = drilled((0.003, -0.03), (0.003, -0.008), (RADIUS, -0.008))
+    wide, narrow = hole_of(part, peg=pin(0.010)), hole_of(part, peg=pin(0.006))
+    assert wide.depth == pytest.approx(0.008) and not wide.through
+    assert narrow.depth == pytest.approx(0.03) and narrow.chamfer == pytest.approx(0.008) and narrow.through
+    for hole, peg in ((wide, pin(0.010)), (narrow, pin(0.006))):
+        assert fit_in(hole, peg).clearance == pytest.approx(0.0002, abs=2e-5)
+    with pytest.raises(InputError, match="does not fit the hole"):
+        fit_in(hole_of(part, peg=pin(0.014)), pin(0.014))
+
+
+@pytest.mark.parametrize("length", [0.003, 0.015])
+def test_a_peg_with_a_cone_is_as_wide_as_what_goes_in(length: float) -> None:
+    part = block_with_hole(round_outline(2.0 * RADIUS), (0.06, 0.06, 0.025))
+    hole = hole_of(part)
+    assert fit_in(hole, coned(0.0098, length)).clearance == pytest.approx(0.0002, abs=2e-5)
+    with pytest.raises(InputError, match="does not fit the hole"):
+        fit_in(hole, coned(0.014, length))
+    # What stays above the part is not asked for: this one is 8 mm wide where the hole ends, 14 mm at its top.
+    assert fit_in(hole, coned(0.014, 0.075, tip=0.005)).clearance == pytest.approx(0.002, abs=1e-4)
