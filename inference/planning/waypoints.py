@@ -89,7 +89,7 @@ def top_of(part: Part) -> float:
 
 
 def tip_of(peg: Part) -> float:
-    """The height z of a peg's tip in its frame, metres: of its lowest end, with a warning if that is none."""
+    """The height z of a peg's tip in its frame, its lowest, metres; warns where that is probably no tip."""
     for doubt in peg_doubt(peg):
         # At this line for all planners, so that Python shows it once.
         warnings.warn(doubt, RuntimeWarning, stacklevel=1)
