@@ -304,7 +304,7 @@ def test_depth_images_of_integers_and_floats(name: str, kind: str, tmp_path: Pat
 def test_a_depth_image_of_8_bits_is_refused(tmp_path: Path) -> None:
     for shape in ((2, 3), (2, 3, 3)):
         Image.fromarray(np.full(shape, 70, np.uint8)).save(tmp_path / "a.png")
-        with pytest.raises(InputError, match="has 8 bits, too few for a depth"):
+        with pytest.raises(InputError, match="8 bits"):
             read_depth(tmp_path / "a.png", CAMERA)
 
 
