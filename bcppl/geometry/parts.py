@@ -174,15 +174,17 @@ class Part:
 
 def _bodies(faces: Indices) -> Indices:
     """The body (F,) of each face of a closed mesh: faces that share edges are of one."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
+    # Not by scipy: a recording is described without it.
     low, high = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)).T
     one, other = (np.lexsort((low, high)) // 3).reshape(-1, 2).T
-    _, body = connected_components(
-        coo_array((np.ones(len(one)), (one, other)), shape=(len(faces), len(faces))), directed=False
-    )
-    return np.asarray(body)
+    body, before = np.arange(len(faces)), np.full(len(faces), -1)
+    while not np.array_equal(body, before):
+        before, least = body, np.minimum(body[one], body[other])
+        body = body.copy()
+        np.minimum.at(body, one, least)
+        np.minimum.at(body, other, least)
+        body = body[body]
+    return np.asarray(np.unique(body, return_inverse=True)[1])
 
 
 def _winding(corners: Array) -> float:
