@@ -157,15 +157,16 @@ def _stays_on(problem: PlanningProblem, world_from_peg: Array, displacement: Arr
 
 
 def _insertions(problem: PlanningProblem, most: int) -> Iterator[InsertionPlan]:
-    """Insertions at the belief's mean, then at particles drawn by weight, with the belief's uncertainty."""
+    """Insertions at the belief's heaviest mode, then at particles drawn by weight, with the belief's uncertainty."""
     belief, generator = problem.belief, problem.generator(2)
-    hole = hole_of(problem.part) if problem.hole is None else problem.hole
+    hole = hole_of(problem.part, peg=problem.held_peg) if problem.hole is None else problem.hole
+    middle = poses.inverse(belief.modes()[0].mean)
     weights = belief.weights.numpy()
     drawn = generator.choice(len(weights), size=max(most - 1, 0), p=weights / weights.sum())
     for k in (None, *drawn):
         shifted = belief
         if k is not None:
-            shift = poses.compose(belief.world_from_part[k], poses.inverse(belief.mean))
+            shift = poses.compose(belief.world_from_part[k], middle)
             shifted = belief.moved(poses.compose(shift, belief.world_from_part))
         yield insertion_plan(shifted, problem.part, problem.held_peg, hole, problem.insertion_parameters)
 
