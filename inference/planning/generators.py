@@ -157,7 +157,7 @@ def _stays_on(problem: PlanningProblem, world_from_peg: Array, displacement: Arr
 
 
 def _insertions(problem: PlanningProblem, most: int) -> Iterator[InsertionPlan]:
-    """Insertions at the belief's heaviest mode, then at particles drawn by weight, with the belief's uncertainty."""
+    """Insertions at the belief's heaviest mode, then at particles drawn by weight, as uncertain."""
     belief, generator = problem.belief, problem.generator(2)
     hole = hole_of(problem.part, peg=problem.held_peg) if problem.hole is None else problem.hole
     middle = poses.inverse(belief.modes()[0].mean)
