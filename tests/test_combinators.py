@@ -149,6 +149,18 @@ def test_sequence_keeps_its_order_and_cycle_draws_one_for_each_particle() -> Non
     )
 
 
+@pytest.mark.parametrize("combine", [lambda k: repeat(k, 3), lambda k: sequence(k, FRESH, k)])
+def test_a_kernel_that_comes_again_is_fitted_once(combine: Callable[[Kernel], Kernel]) -> None:
+    fits: list[Population] = []
+
+    def counted(population: Population) -> Move:
+        fits.append(population)
+        return SHORT(population)
+
+    combine(counted)(Population(simulate(lopsided, (), 10)))
+    assert len(fits) == 1
+
+
 def test_acceptance_is_the_mean_over_what_was_tried() -> None:
     one, two = adding(1.0, 1.0, []), adding(2.0, 0.25, [])
     for kernel in (sequence(one, two), cycle(one, two)):

@@ -199,11 +199,14 @@ def test_chains_are_fitted_once_to_the_others() -> None:
         markov_chains(spying, trace, 0)
 
 
-def test_draws_of_an_lkj_prior_have_its_density() -> None:
+@pytest.mark.parametrize("event", [False, True])
+def test_draws_of_an_lkj_prior_have_its_density(event: bool) -> None:
     """Torch's have not from the third row on. Exact values by quadrature over a correlation's density."""
 
     def correlated() -> None:
-        factor = pyro.sample("factor", dist.LKJCholesky(3, torch.tensor(1.5, dtype=torch.float64)))
+        shape = torch.full((2,) if event else (), 1.5, dtype=torch.float64)
+        factor = pyro.sample("factor", dist.LKJCholesky(3, shape).to_event(len(shape.shape)))
+        factor = factor[..., 0, :, :] if event else factor
         pyro.sample("y", dist.Normal((factor @ factor.transpose(-1, -2))[..., 2, 1], 0.3))
 
     torch.manual_seed(0)

@@ -13,6 +13,8 @@ import torch
 from torch import Tensor
 from torch.distributions import Independent
 
+from bcppl.distributions.support import base
+
 # Below this many entries nothing is gained.
 MANY = 1000
 
@@ -53,8 +55,9 @@ def _once(scale: Tensor) -> Tensor:
 
 def drawn(distribution: Any) -> Tensor | None:
     """A draw of many normals (`centred_normals`) or an LKJ prior; None leaves it to the distribution."""
-    if isinstance(distribution, dist.LKJCholesky):
-        return _onion(distribution).sample()
+    innermost = base(distribution)
+    if isinstance(innermost, dist.LKJCholesky):
+        return _onion(innermost).sample()
     if type(distribution) is not dist.Normal:
         return None
     mean = distribution.loc

@@ -98,7 +98,7 @@ def kernel(pose: str, proposals: Callable[[Any], Sequence[Program]], *, screen: 
         guided = [first, *_one_of(further)]
         if screen and runs_physics(population.trace):
             # There and back: an order that all particles share is reversible only so.
-            guided = [surrogate_transition(sequence([*guided, *guided[-2::-1]]), approximated)]
+            guided = [surrogate_transition(sequence([*guided, *reversed(guided[:-1])]), approximated)]
         return sequence([*_one_of(walks), *guided])(population)
 
     return move_of

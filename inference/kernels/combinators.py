@@ -30,10 +30,12 @@ from bcppl.traces import Trace
 
 
 def _one_after_another(kernels: Sequence[Kernel]) -> Kernel:
-    """The moves of several kernels, one after another."""
+    """The moves of several kernels, one after another; one that comes again is fitted once."""
 
     def together(population: Population) -> Move:
-        moves = [fitted(kernel, population) for kernel in kernels]
+        each_once = {id(kernel): kernel for kernel in kernels}
+        made = {key: fitted(kernel, population) for key, kernel in each_once.items()}
+        moves = [made[id(kernel)] for kernel in kernels]
 
         def move(trace: Trace, target: Target) -> tuple[Trace, Tensor]:
             total = torch.zeros(trace.particles, dtype=torch.float64)
