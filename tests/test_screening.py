@@ -20,10 +20,12 @@ from bcppl.inference.filters.guided_smc import Approximation
 from bcppl.inference.filters.screening import COPIES, approximated, screened, screened_draws
 from bcppl.inference.filters.smcp3 import Pair
 from bcppl.inference.filters.step import Observed
-from bcppl.inference.kernels import delayed_acceptance, metropolis_hastings, moved_by
+from bcppl.inference.kernels import delayed_acceptance, metropolis_hastings, moved_by, surrogate_transition
+from bcppl.inference.kernels.rejuvenation import Moved
+from bcppl.inference.kernels.staged import SurrogateTarget
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import drift
-from bcppl.inference.targets import POSTERIOR
+from bcppl.inference.targets import POSTERIOR, Target
 from bcppl.poses import Freedom
 from bcppl.traces import Trace, simulate
 
@@ -87,7 +89,11 @@ def exactly(values: Sequence[float]) -> tuple[float, float, float]:
 
 
 def assimilated(particles: int) -> Population:
-    """Both measurements, each by copies that the cheap likelihood has screened."""
+    """Both measurements, each by copies that the cheap likelihood has screened and moved."""
+
+    def moves(population: Population, target: Target) -> Moved:
+        return moved_by(population, metropolis_hastings(around(0.012, 0.02)), target, 2)
+
     population = Population(
         simulate(program, (0,), particles),
         torch.zeros(particles, dtype=torch.float64),
@@ -97,9 +103,9 @@ def assimilated(particles: int) -> Population:
         observed = Observed((count,), {f"felt_{count - 1}": torch.tensor(SEEN[count - 1]).double()})
         before = population.approximation
         pair = Pair(around(goal, 0.015), around(0.0, 0.02))
-        done = screened(population.with_approximation(Cheap(count)), before, observed, pair)
+        done = screened(population.with_approximation(Cheap(count)), before, observed, pair, moves)
         assert done is not None
-        population = done[0]
+        population = done.population
     return population
 
 
@@ -145,6 +151,18 @@ def test_draws_are_weighted_by_the_physics() -> None:
     error = torch.tensor(ratios).std() / math.sqrt(len(ratios))
     assert abs(float(torch.tensor(ratios).mean()) - 1.0) < 3.5 * float(error)
     assert float(error) < 0.05
+
+
+def test_a_surrogate_transition_towards_a_surrogate_runs_no_physics() -> None:
+    torch.manual_seed(4)
+    observations = {f"felt_{k}": torch.tensor(value).double() for k, value in enumerate(SEEN)}
+    trace = simulate(program, (0,), 50).revised({}, args=(2,), observations=observations)
+    begun = Population(trace, approximation=Cheap(2))
+    kernel = surrogate_transition(metropolis_hastings(around(0.012, 0.02)), approximated)
+    Felt.evaluated = 0
+    moved = moved_by(begun, kernel, SurrogateTarget(log_density=approximated(begun)), 3)
+    assert moved.acceptance > 0.2
+    assert Felt.evaluated == 0
 
 
 def test_moves_decided_by_the_cheap_likelihood_first_keep_the_posterior() -> None:

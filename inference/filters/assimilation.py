@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 from torch import Tensor
 
 from bcppl.errors import NoWeightError
 from bcppl.inference.approximations.approximation import Approximation
-from bcppl.inference.filters.screening import by_mode, screened
+from bcppl.inference.filters.screening import COPIES, by_mode, screened
 from bcppl.inference.filters.smcp3 import Pair, move_and_weight
 from bcppl.inference.filters.step import Observed
+from bcppl.inference.kernels.rejuvenation import Moved
 from bcppl.inference.population import Population
 from bcppl.inference.sizing import replicate
+from bcppl.inference.targets import Target
 
 FEW = 0.2  # the effective sample size that SMCP3 is to leave, as a share of N
 AMPLE = 30.0  # the same, enough for any N
@@ -30,6 +33,7 @@ class Assimilated(NamedTuple):
     population: Population  # of N particles
     effective: float  # the effective sample size of all copies
     origin: Tensor | None  # (N,) the particle that each copy was made of; None where each is its own
+    moved: Moved | None = None  # what moves before physics did, where there were any
 
 
 def assimilate(population: Population, observed: Observed, pair: Pair, least: int = 1) -> Assimilated | None:
@@ -65,11 +69,16 @@ def assimilate(population: Population, observed: Observed, pair: Pair, least: in
 
 
 def assimilate_screened(
-    population: Population, before: Approximation, observed: Observed, pair: Pair
+    population: Population,
+    before: Approximation,
+    observed: Observed,
+    pair: Pair,
+    moves: Callable[[Population, Target], Moved],
+    least: int = 1,
 ) -> Assimilated | None:
-    """The same where a cheap likelihood chooses among copies, and the others are simulated."""
-    reached = screened(population, before, observed, pair)
-    if reached is None or reached[0].effective_sample_size < LEAST * len(population):
+    """The same where a cheap likelihood chooses among copies and moves them, before they are simulated."""
+    reached = screened(population, before, observed, pair, moves, max(least, COPIES))
+    if reached is None or reached.population.effective_sample_size < LEAST * len(population):
         return None
-    few, origin = reached
-    return Assimilated(few, few.effective_sample_size, origin)
+    few, origin, moved = reached
+    return Assimilated(few, few.effective_sample_size, origin, moved)

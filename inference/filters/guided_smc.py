@@ -39,7 +39,7 @@ from bcppl.inference.filters.tempering import resample_move, tempered
 from bcppl.inference.filters.view_search import is_refuted, searched_by_climbing
 from bcppl.inference.kernels import Kernel, metropolis_hastings, sequence, surrogate_transition
 from bcppl.inference.kernels.kernel import Move
-from bcppl.inference.kernels.rejuvenation import Until, until
+from bcppl.inference.kernels.rejuvenation import Moved, Until, moved_by, until
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import drift
 from bcppl.inference.proposals.approximated import (
@@ -51,7 +51,7 @@ from bcppl.inference.proposals.approximated import (
     joint_random_walk,
 )
 from bcppl.inference.proposals.coordinates import continuous_addresses
-from bcppl.inference.targets import POSTERIOR, runs_physics
+from bcppl.inference.targets import POSTERIOR, Target, runs_physics
 from bcppl.sensors.capabilities import Defers, FitsPose
 from bcppl.traces import Model, Program, Trace, extend
 
@@ -127,7 +127,8 @@ def guided(
         moves: of every particle after each step.
         sweeps: how many of them, or `until(...)`.
         threshold: particles are resampled below this effective sample size, as a share of N.
-        screen: whether a cheap likelihood of what is simulated chooses among copies of the particles.
+        screen: whether a cheap likelihood of what is simulated chooses among copies of the particles and
+            moves them, before each is simulated. Then `moves` are not made again, but for a resampling.
         search: given the population after each step and the trace before it, returns that population or
             another that takes its place, and where its particles come from.
     """
@@ -139,6 +140,12 @@ def guided(
         return population.selected(ancestors), ancestors
 
     rejuvenation = resample_move(moves, sweeps, resample, always_move=True)
+    # Particles that were moved by a cheap target are moved by physics only where they were resampled for it.
+    by_physics = resample_move(moves, sweeps, resample)
+
+    def cheaply(population: Population, target: Target) -> Moved:
+        return moved_by(population, moves, target, sweeps)
+
     doubled = 2 if isinstance(sweeps, Until) else 2 * sweeps
     by_tempering = tempered(moves, sweeps=doubled, resample=resample)
 
@@ -157,13 +164,18 @@ def guided(
         population = population.with_approximation(after)
         least = math.ceil(SEVERAL / len(population)) if after.is_ambiguous else 1
         kernels = pair(before, after, action)
-        if screen and after.screens(action):
-            assimilated = assimilate_screened(population, before, observed, kernels)
+        screens = screen and any(after.screens(each) for each in actions)
+        if screens:
+            assimilated = assimilate_screened(population, before, observed, kernels, cheaply, least)
         else:
             assimilated = assimilate(population, observed, kernels, least)
         if assimilated is None:
             return settled(by_tempering(population, observed), population.trace)
-        moved, ancestors, acceptance, displaced = rejuvenation(assimilated.population, POSTERIOR)
+        moved, ancestors, acceptance, displaced = (by_physics if screens else rejuvenation)(
+            assimilated.population, POSTERIOR
+        )
+        if acceptance is None and assimilated.moved is not None:
+            _, acceptance, displaced = assimilated.moved
         info = _info(population, moved, assimilated, acceptance, ancestors)._replace(displacement=displaced)
         return settled(Stepped(moved, info), population.trace)
 
@@ -264,7 +276,8 @@ def infer(
             where they were, by `DISPLACED` variances along each axis, and at most `MOST_SWEEPS`.
         threshold: particles are resampled below this effective sample size, as a share of N.
         screen: whether a cheap likelihood of what is simulated chooses among copies of the particles and
-            decides their moves first (`bcppl.inference.filters.screening`), where the model has one.
+            moves them, before each is simulated (`bcppl.inference.filters.screening`), where the model has
+            one.
         scene: `model.prepare(recording)` unless given.
         start: a step to continue from, as for `bcppl.inference.smc`.
         device: where the particles are, as for `bcppl.inference.smc`.

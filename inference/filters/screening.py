@@ -1,28 +1,32 @@
-"""Physics is run for few: a cheap likelihood chooses among copies of the particles, and decides moves first.
+"""Physics is run for few: a cheap likelihood chooses among copies of the particles, and moves them first.
 
 Contact physics takes a hundred times as long as the gap between two solids. Where a likelihood is simulated
 and another one of the same measurements is cheap (`bcppl.sensors.capabilities.Screens`), the cheap one takes
-its place in a target of its own: copies of the particles are weighted for that and resampled, and only those
-that survive are simulated and weighted by what remains, the ratio of the two targets. Both steps are proper
-weightings (Naesseth, Lindsten and Schoen, Nested sequential Monte Carlo methods, ICML 2015), so the result
-targets the posterior whatever the cheap likelihood is; a poor one costs effective particles. In moves it is
-the surrogate of transitions (`bcppl.inference.kernels.surrogate_transition`).
+its place in a target of its own. At each measurement the particles are weighted for that target, copied,
+given the measurement, resampled and moved, all without physics; then each is simulated once and weighted by
+the ratio of the posterior to the cheap target. Every stage is a proper weighting (Naesseth, Lindsten and
+Schoen, Nested sequential Monte Carlo methods, ICML 2015), so the result targets the posterior whatever the
+cheap likelihood is; a poor one costs effective particles. Where these are few, particles are resampled, and
+moved by transitions that the cheap target decides first (`bcppl.inference.kernels.surrogate_transition`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
+import torch
 from torch import Tensor
 
 from bcppl.errors import NoWeightError
 from bcppl.inference.filters.smcp3 import Pair, move_and_weight
 from bcppl.inference.filters.step import Observed
+from bcppl.inference.kernels.rejuvenation import Moved
+from bcppl.inference.kernels.staged import SurrogateTarget
 from bcppl.inference.population import Population
 from bcppl.inference.resampling import systematic
 from bcppl.inference.sizing import replicate
-from bcppl.inference.targets import PHYSICS, POSTERIOR, cost_of
+from bcppl.inference.targets import PHYSICS, POSTERIOR, Target, cost_of
 from bcppl.traces import Trace, Update, propose
 from bcppl.traces.verbs import constrained
 
@@ -35,22 +39,40 @@ def approximated(population: Population) -> Callable[[Trace], Tensor]:
     return lambda trace: _cheap_log_density(trace, approximation)
 
 
+class Screened(NamedTuple):
+    """A population given one more measurement.
+
+    Attributes:
+        population: of N particles.
+        origin: (N,) which particle each was made of.
+        moved: what moves by the cheap target did.
+    """
+
+    population: Population
+    origin: Tensor
+    moved: Moved
+
+
 def screened(
     population: Population,
     before: Any,
     observed: Observed,
     pair: Pair,
-) -> tuple[Population, Tensor] | None:
-    """N particles given one more measurement, of copies that the cheap target has weighted.
+    moves: Callable[[Population, Target], Moved],
+    copies: int = COPIES,
+) -> Screened | None:
+    """N particles given one more measurement, of copies that the cheap target has weighted and moved.
 
     Args:
         population: of N particles, whose approximation is given the measurement.
         before: the approximation that is not.
         observed: the measurement; latent values that come with it are drawn from the program.
         pair: moves a particle.
+        moves: of the particles that survive, towards a target.
+        copies: of each particle.
 
     Returns:
-        The population, and which particle each was made of; None where none keeps any weight.
+        None where no particle keeps any weight.
     """
     after = population.approximation
 
@@ -59,14 +81,19 @@ def screened(
         # What came with the measurement was drawn from the program.
         return now - then - (updated.trace.log_prob(*updated.drawn) if updated.drawn else 0.0)
 
-    many = replicate(population, COPIES)
+    # What the physics of the measurements before has decided is divided out, and decided again at the end.
+    weighing = _cheap_log_density(population.trace, before) - POSTERIOR(population.trace)
+    alive = population.log_weights > -torch.inf
     try:
+        many = replicate(population.reweighed(torch.where(alive, weighing, 0.0)), copies)
         by_cheap = move_and_weight(many, pair, observed, ratio)
         chosen = by_mode(by_cheap, len(population))
-        few, old = by_cheap.selected(chosen), many.trace[chosen]
-        drawn = frozenset(address for address in few.trace.choices if address not in old.choices)
-        change = Update(few.trace, old, {}, drawn)
-        return few.reweighed(change.log_ratio - ratio(change)), chosen // COPIES
+        few = by_cheap.selected(chosen)
+        few = few.with_trace(few.trace.without_states())
+        moved = moves(few, SurrogateTarget(log_density=approximated(few)))
+        few = moved.population
+        weighed = few.reweighed(POSTERIOR(few.trace) - _cheap_log_density(few.trace, after))
+        return Screened(weighed, chosen // copies, moved)
     except NoWeightError:
         return None
 

@@ -233,7 +233,7 @@ def surrogate_transition(kernel: Kernel, surrogate: Surrogate) -> Kernel:
         move, log_density = fitted(kernel, population), surrogate(population)
 
         def transition(trace: Trace, target: Target) -> tuple[Trace, Tensor]:
-            if not isinstance(target, Target):
+            if not isinstance(target, Target) or isinstance(target, SurrogateTarget):
                 return move(trace, target)  # a function of the whole trace has no costly sites
             begun = trace.without_states()
             walked, _ = move(begun, SurrogateTarget(log_density=log_density))
