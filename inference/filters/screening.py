@@ -39,7 +39,7 @@ def approximated(population: Population) -> Callable[[Trace], Tensor]:
     return lambda trace: _cheap_log_density(trace, approximation)
 
 
-class Screened(NamedTuple):
+class Survivors(NamedTuple):
     """A population given one more measurement.
 
     Attributes:
@@ -60,7 +60,7 @@ def screened(
     pair: Pair,
     moves: Callable[[Population, Target], Moved],
     copies: int = COPIES,
-) -> Screened | None:
+) -> Survivors | None:
     """N particles given one more measurement, of copies that the cheap target has weighted and moved.
 
     Args:
@@ -93,7 +93,7 @@ def screened(
         moved = moves(few, SurrogateTarget(log_density=approximated(few)))
         few = moved.population
         weighed = few.reweighed(POSTERIOR(few.trace) - _cheap_log_density(few.trace, after))
-        return Screened(weighed, chosen // copies, moved)
+        return Survivors(weighed, chosen // copies, moved)
     except NoWeightError:
         return None
 
