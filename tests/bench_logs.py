@@ -92,6 +92,7 @@ class Log:
         noise: standard deviations of force (N), torque (N m) and position (m).
         skip: rows of the wrench that are lost: (first, last).
         drift: of the wrench's clock, ppm.
+        jumps: (when, s after the beginning of the log; by how much) the wrench's clock is set on.
         bends: m/N by which the encoders go on while the peg rests on the part.
         in_base: whether the wrench is a controller's: compensated, what the peg exerts, in the base's axes
             about the flange.
@@ -104,6 +105,7 @@ class Log:
     noise: tuple[float, float, float] = (0.0, 0.0, 0.0)
     skip: tuple[tuple[int, int], ...] = ()
     drift: float = 0.0
+    jumps: tuple[float, float] = (0.0, 0.0)
     bends: float = 0.0
     in_base: bool = False
     seed: int = 0
@@ -148,6 +150,7 @@ def write(folder: Path, there: Truth, log: Log | None = None) -> Path:
         size=(len(there.times), 6)
     ) * np.repeat(log.noise[:2], 3)
     stamps = log.start + there.times * (1.0 + 1e-6 * log.drift) + log.late
+    stamps += np.where(there.times > log.jumps[0], log.jumps[1], 0.0)
     kept = np.ones(len(stamps), dtype=bool)
     for first, last in log.skip:
         kept[first:last] = False

@@ -53,6 +53,7 @@ class Lateness:
         drift_spread: its standard deviation.
         at: s.
         contacts: how many it is estimated from.
+        contradicting: s, on the force's clock, of those that by themselves put it elsewhere.
     """
 
     late: float
@@ -61,6 +62,7 @@ class Lateness:
     drift_spread: float
     at: float
     contacts: int
+    contradicting: tuple[float, ...] = ()
 
 
 def on_one_clock(
@@ -89,6 +91,14 @@ def on_one_clock(
             f"clocks: the motion does not show how late the wrench is (from {-1000.0 * within:.0f} to "
             f"{1000.0 * within:.0f} ms), and nothing is taken off; state clock.wrench_late, or log straight "
             "guarded touches at 20 mm/s and more"
+        )
+        return wrench
+    if found.contradicting:
+        which = ", ".join(f"{time - float(wrench.times[0]):.1f}" for time in found.contradicting[:5])
+        report.append(
+            f"clocks: the contacts at {which} s of the wrench's log put its lateness elsewhere than the "
+            f"others ({1000.0 * found.late:.1f} ms), as where a clock is set while it is read, and nothing "
+            "is taken off; cut the log between them, or state clock.wrench_late"
         )
         return wrench
     words = f"clocks: the wrench is {1000.0 * found.late:.1f} ± {1000.0 * found.spread:.1f} ms late"
@@ -121,7 +131,8 @@ def lateness(force: Stream, position: Stream, within: float, drifts: bool = Fals
     coarse, fine = (_thinned(position, step) for step in _THIN)
     steps = round(within / _COARSE)
     every = np.asarray(_COARSE * np.arange(-steps, steps + 1))
-    evidence = _of_all(log_evidence(felt, coarse, noise, every))
+    separate = log_evidence(felt, coarse, noise, every)
+    evidence = _of_all(separate)
     most, weight = evidence.max(axis=1), _weight(evidence)
     probable = every[weight > weight.max() - _IMPROBABLE]
     low, high = probable[0] - _COARSE, probable[-1] + _COARSE
@@ -145,6 +156,8 @@ def lateness(force: Stream, position: Stream, within: float, drifts: bool = Fals
     far = np.abs(every - late) > max(_FAR, 3.0 * spread)
     if spread > _KNOWN or most[far].max(initial=0.0) > _RIVAL * most[~far].max(initial=0.0):
         return None
+    own = separate.reshape(len(felt), len(every), -1).max(axis=2)
+    contradicts = own[:, far].max(axis=1, initial=-np.inf) > own[:, ~far].max(axis=1) + _IMPROBABLE
     return Lateness(
         late=float(late),
         spread=spread,
@@ -152,6 +165,7 @@ def lateness(force: Stream, position: Stream, within: float, drifts: bool = Fals
         drift_spread=float(np.sqrt(share.sum(axis=1) @ np.square(rates - drift))),
         at=middle,
         contacts=len(felt),
+        contradicting=tuple(times[contradicts].tolist()),
     )
 
 
