@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +17,13 @@ from bcppl import poses
 from bcppl.distributions.lazy import LazyDistribution
 from bcppl.distributions.poses import NormalPose
 from bcppl.inference.filters.guided_smc import Approximation
-from bcppl.inference.filters.screening import COPIES, approximated, screened, screened_draws
+from bcppl.inference.filters.screening import (
+    COPIES,
+    approximated,
+    screened,
+    screened_and_moved,
+    screened_draws,
+)
 from bcppl.inference.filters.smcp3 import Pair
 from bcppl.inference.filters.step import Observed
 from bcppl.inference.kernels import delayed_acceptance, metropolis_hastings, moved_by, surrogate_transition
@@ -88,33 +94,42 @@ def exactly(values: Sequence[float]) -> tuple[float, float, float]:
     return float(evidence), float(y.sum() / NOISE**2 / precision), precision**-0.5
 
 
-def assimilated(particles: int) -> Population:
-    """Both measurements, each by copies that the cheap likelihood has screened and moved."""
+def in_place(*given: Any) -> Population:
+    """A measurement by copies that the cheap likelihood has screened."""
+    return screened(*given).population
+
+
+def moved(*given: Any) -> Population:
+    """The same where they are moved by it before they are simulated."""
 
     def moves(population: Population, target: Target) -> Moved:
         return moved_by(population, metropolis_hastings(around(0.012, 0.02)), target, 2)
 
-    population = Population(
-        simulate(program, (0,), particles),
-        torch.zeros(particles, dtype=torch.float64),
-        approximation=Cheap(0),
-    )
+    done = screened_and_moved(*given, moves, 0.0)
+    assert done is not None
+    return done.population
+
+
+def assimilated(particles: int, by: Callable[..., Population]) -> Population:
+    """Both measurements."""
+    population = Population(simulate(program, (0,), particles), approximation=Cheap(0))
     for count, goal in ((1, 0.009), (2, 0.013)):
         observed = Observed((count,), {f"felt_{count - 1}": torch.tensor(SEEN[count - 1]).double()})
         before = population.approximation
         pair = Pair(around(goal, 0.015), around(0.0, 0.02))
-        done = screened(population.with_approximation(Cheap(count)), before, observed, pair, moves)
-        assert done is not None
-        population = done.population
+        population = by(population.with_approximation(Cheap(count)), before, observed, pair)
     return population
 
 
-def test_evidence_and_mean_are_those_of_the_physics_whatever_the_cheap_likelihood_is() -> None:
+@pytest.mark.parametrize("by", [in_place, moved])
+def test_evidence_and_mean_are_those_of_the_physics_whatever_the_cheap_likelihood_is(
+    by: Callable[..., Population],
+) -> None:
     torch.manual_seed(0)
     log_evidence, mean, _ = exactly(SEEN)
     ratios, means = [], []
-    for _ in range(300):
-        population = assimilated(60)
+    for _ in range(250):
+        population = assimilated(60, by)
         ratio = math.exp(population.log_evidence - log_evidence)
         x = float((population.belief("part").weights * population.trace["part"][:, 0]).sum())
         ratios.append(ratio)
@@ -125,12 +140,25 @@ def test_evidence_and_mean_are_those_of_the_physics_whatever_the_cheap_likelihoo
         assert error < (0.07 if expected else 0.0007)
 
 
+def test_where_physics_says_much_beyond_the_cheap_likelihood_it_is_not_divided_out() -> None:
+    torch.manual_seed(5)
+    population = assimilated(60, in_place)
+    observed = Observed((3,), {"felt_2": torch.tensor(SEEN[1]).double()})
+    given = (population, population.approximation, observed, Pair(around(0.013, 0.015), around(0.013, 0.02)))
+
+    def moves(population: Population, target: Target) -> Moved:
+        raise AssertionError("nothing is moved")
+
+    assert screened_and_moved(*given, moves, 59.0) is None
+
+
 def test_only_those_that_survive_are_simulated() -> None:
     torch.manual_seed(1)
-    Felt.evaluated = 0
-    assimilated(50)
-    # The first measurement for N particles, then both for N that have moved; not for their copies.
-    assert Felt.evaluated <= 3 * 50 < COPIES * 50
+    for by in (in_place, moved):
+        Felt.evaluated = 0
+        assimilated(50, by)
+        # The first measurement for N particles, then both for N that have moved; not for their copies.
+        assert Felt.evaluated <= 3 * 50 < COPIES * 50
 
 
 def test_draws_are_weighted_by_the_physics() -> None:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from typing import NamedTuple
 
 from torch import Tensor
 
 from bcppl.errors import NoWeightError
 from bcppl.inference.approximations.approximation import Approximation
-from bcppl.inference.filters.screening import COPIES, by_mode, screened
+from bcppl.inference.filters.screening import COPIES, Survivors, by_mode, screened, screened_and_moved
 from bcppl.inference.filters.smcp3 import Pair, move_and_weight
 from bcppl.inference.filters.step import Observed
 from bcppl.inference.kernels.rejuvenation import Moved
@@ -74,11 +75,20 @@ def assimilate_screened(
     observed: Observed,
     pair: Pair,
     moves: Callable[[Population, Target], Moved],
+    threshold: float,
     least: int = 1,
 ) -> Assimilated | None:
-    """The same where a cheap likelihood chooses among copies and moves them, before they are simulated."""
-    reached = screened(population, before, observed, pair, moves, max(least, COPIES))
-    if reached is None or reached.population.effective_sample_size < LEAST * len(population):
+    """The same where a cheap likelihood chooses among copies, and the others are simulated.
+
+    They have been `moved` before that where physics says so little beyond it that a share `threshold` of the
+    particles stays effective.
+    """
+    count, copies = len(population), max(least, COPIES)
+    few: Survivors | None = None
+    with suppress(NoWeightError):
+        few = screened_and_moved(population, before, observed, pair, moves, threshold * count, copies)
+    with suppress(NoWeightError):
+        few = few or screened(population, before, observed, pair, copies)
+    if few is None or few.population.effective_sample_size < LEAST * count:
         return None
-    few, origin, moved = reached
-    return Assimilated(few, few.effective_sample_size, origin, moved)
+    return Assimilated(few.population, few.population.effective_sample_size, few.origin, few.moved)

@@ -35,7 +35,7 @@ from bcppl.inference.filters.second_search import Searched, searched
 from bcppl.inference.filters.smc import Step, smc
 from bcppl.inference.filters.smcp3 import Pair
 from bcppl.inference.filters.step import Observed, StepFunction, StepInfo, Stepped, descended
-from bcppl.inference.filters.tempering import resample_move, tempered
+from bcppl.inference.filters.tempering import Rejuvenated, resample_move, tempered
 from bcppl.inference.filters.view_search import is_refuted, searched_by_climbing
 from bcppl.inference.kernels import Kernel, metropolis_hastings, sequence, surrogate_transition
 from bcppl.inference.kernels.kernel import Move
@@ -128,7 +128,7 @@ def guided(
         sweeps: how many of them, or `until(...)`.
         threshold: particles are resampled below this effective sample size, as a share of N.
         screen: whether a cheap likelihood of what is simulated chooses among copies of the particles and
-            moves them, before each is simulated. Then `moves` are not made again, but for a resampling.
+            moves them before each is simulated, where physics says little beyond that likelihood.
         search: given the population after each step and the trace before it, returns that population or
             another that takes its place, and where its particles come from.
     """
@@ -140,11 +140,15 @@ def guided(
         return population.selected(ancestors), ancestors
 
     rejuvenation = resample_move(moves, sweeps, resample, always_move=True)
-    # Particles that were moved by a cheap target are moved by physics only where they were resampled for it.
-    by_physics = resample_move(moves, sweeps, resample)
 
     def cheaply(population: Population, target: Target) -> Moved:
         return moved_by(population, moves, target, sweeps)
+
+    def rejuvenated(assimilated: Assimilated) -> Rejuvenated:
+        if assimilated.moved is None:
+            return rejuvenation(assimilated.population, POSTERIOR)
+        _, acceptance, displacement = assimilated.moved
+        return Rejuvenated(assimilated.population, None, acceptance, displacement)
 
     doubled = 2 if isinstance(sweeps, Until) else 2 * sweeps
     by_tempering = tempered(moves, sweeps=doubled, resample=resample)
@@ -166,16 +170,14 @@ def guided(
         kernels = pair(before, after, action)
         screens = screen and any(after.screens(each) for each in actions)
         if screens:
-            assimilated = assimilate_screened(population, before, observed, kernels, cheaply, least)
+            assimilated = assimilate_screened(
+                population, before, observed, kernels, cheaply, threshold, least
+            )
         else:
             assimilated = assimilate(population, observed, kernels, least)
         if assimilated is None:
             return settled(by_tempering(population, observed), population.trace)
-        moved, ancestors, acceptance, displaced = (by_physics if screens else rejuvenation)(
-            assimilated.population, POSTERIOR
-        )
-        if acceptance is None and assimilated.moved is not None:
-            _, acceptance, displaced = assimilated.moved
+        moved, ancestors, acceptance, displaced = rejuvenated(assimilated)
         info = _info(population, moved, assimilated, acceptance, ancestors)._replace(displacement=displaced)
         return settled(Stepped(moved, info), population.trace)
 
@@ -276,8 +278,7 @@ def infer(
             where they were, by `DISPLACED` variances along each axis, and at most `MOST_SWEEPS`.
         threshold: particles are resampled below this effective sample size, as a share of N.
         screen: whether a cheap likelihood of what is simulated chooses among copies of the particles and
-            moves them, before each is simulated (`bcppl.inference.filters.screening`), where the model has
-            one.
+            decides about their moves first (`bcppl.inference.filters.screening`), where the model has one.
         scene: `model.prepare(recording)` unless given.
         start: a step to continue from, as for `bcppl.inference.smc`.
         device: where the particles are, as for `bcppl.inference.smc`.

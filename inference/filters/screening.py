@@ -2,12 +2,13 @@
 
 Contact physics takes a hundred times as long as the gap between two solids. Where a likelihood is simulated
 and another one of the same measurements is cheap (`bcppl.sensors.capabilities.Screens`), the cheap one takes
-its place in a target of its own. At each measurement the particles are weighted for that target, copied,
-given the measurement, resampled and moved, all without physics; then each is simulated once and weighted by
-the ratio of the posterior to the cheap target. Every stage is a proper weighting (Naesseth, Lindsten and
-Schoen, Nested sequential Monte Carlo methods, ICML 2015), so the result targets the posterior whatever the
-cheap likelihood is; a poor one costs effective particles. Where these are few, particles are resampled, and
-moved by transitions that the cheap target decides first (`bcppl.inference.kernels.surrogate_transition`).
+its place in a target of its own: copies of the particles are weighted for that and resampled, and only those
+that survive are simulated and weighted by what remains, the ratio of the two targets. Where physics has said
+little beyond the cheap target so far, the particles are weighted for that target before, and survivors are
+moved by it, so that each is simulated once. All are proper weightings (Naesseth, Lindsten and Schoen, Nested
+sequential Monte Carlo methods, ICML 2015), so the result targets the posterior whatever the cheap likelihood
+is; a poor one costs effective particles. In other moves it is the surrogate of transitions
+(`bcppl.inference.kernels.surrogate_transition`).
 """
 
 from __future__ import annotations
@@ -18,7 +19,6 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from bcppl.errors import NoWeightError
 from bcppl.inference.filters.smcp3 import Pair, move_and_weight
 from bcppl.inference.filters.step import Observed
 from bcppl.inference.kernels.rejuvenation import Moved
@@ -45,35 +45,79 @@ class Survivors(NamedTuple):
     Attributes:
         population: of N particles.
         origin: (N,) which particle each was made of.
-        moved: what moves by the cheap target did.
+        moved: what moves by the cheap target did; None without any.
     """
 
     population: Population
     origin: Tensor
-    moved: Moved
+    moved: Moved | None = None
 
 
 def screened(
-    population: Population,
-    before: Any,
-    observed: Observed,
-    pair: Pair,
-    moves: Callable[[Population, Target], Moved],
-    copies: int = COPIES,
-) -> Survivors | None:
-    """N particles given one more measurement, of copies that the cheap target has weighted and moved.
+    population: Population, before: Any, observed: Observed, pair: Pair, copies: int = COPIES
+) -> Survivors:
+    """N particles given one more measurement, of copies that the cheap target has weighted.
+
+    What physics has decided about a particle before stays with its copies.
 
     Args:
         population: of N particles, whose approximation is given the measurement.
         before: the approximation that is not.
         observed: the measurement; latent values that come with it are drawn from the program.
         pair: moves a particle.
-        moves: of the particles that survive, towards a target.
+        copies: of each particle.
+
+    Raises:
+        NoWeightError: no particle keeps any weight.
+    """
+    few, origin = _survivors(population, before, observed, pair, copies)
+    decided = _beyond(population.trace[origin], before)
+    return Survivors(few.reweighed(_beyond(few.trace, few.approximation) - decided), origin)
+
+
+def screened_and_moved(
+    population: Population,
+    before: Any,
+    observed: Observed,
+    pair: Pair,
+    moves: Callable[[Population, Target], Moved],
+    least: float,
+    copies: int = COPIES,
+) -> Survivors | None:
+    """The same, where survivors are moved by the cheap target before each is simulated.
+
+    What physics has decided before is divided out, and decided again for the particles where they are then.
+
+    Args:
+        population: as for `screened`.
+        before: as for `screened`.
+        observed: the measurement.
+        pair: moves a particle.
+        moves: of particles towards a target.
+        least: the effective sample size that physics is to leave, before and after the measurement.
         copies: of each particle.
 
     Returns:
-        None where no particle keeps any weight.
+        None where it leaves less: then physics says much beyond the cheap target, and is not to be lost.
+
+    Raises:
+        NoWeightError: no particle keeps any weight.
     """
+    alive = population.log_weights > -torch.inf
+    by_cheap = population.reweighed(torch.where(alive, -_beyond(population.trace, before), 0.0))
+    if by_cheap.effective_sample_size < least:
+        return None
+    few, origin = _survivors(by_cheap, before, observed, pair, copies)
+    few = few.with_trace(few.trace.without_states())
+    moved = moves(few, SurrogateTarget(log_density=approximated(few)))
+    simulated = moved.population.reweighed(_beyond(moved.population.trace, few.approximation))
+    return Survivors(simulated, origin, moved) if simulated.effective_sample_size >= least else None
+
+
+def _survivors(
+    population: Population, before: Any, observed: Observed, pair: Pair, copies: int
+) -> tuple[Population, Tensor]:
+    """N of the copies, which the cheap target has weighted, and which particle (N,) each was made of."""
     after = population.approximation
 
     def ratio(updated: Update) -> Tensor:
@@ -81,21 +125,9 @@ def screened(
         # What came with the measurement was drawn from the program.
         return now - then - (updated.trace.log_prob(*updated.drawn) if updated.drawn else 0.0)
 
-    # What the physics of the measurements before has decided is divided out, and decided again at the end.
-    weighing = _cheap_log_density(population.trace, before) - POSTERIOR(population.trace)
-    alive = population.log_weights > -torch.inf
-    try:
-        many = replicate(population.reweighed(torch.where(alive, weighing, 0.0)), copies)
-        by_cheap = move_and_weight(many, pair, observed, ratio)
-        chosen = by_mode(by_cheap, len(population))
-        few = by_cheap.selected(chosen)
-        few = few.with_trace(few.trace.without_states())
-        moved = moves(few, SurrogateTarget(log_density=approximated(few)))
-        few = moved.population
-        weighed = few.reweighed(POSTERIOR(few.trace) - _cheap_log_density(few.trace, after))
-        return Survivors(weighed, chosen // copies, moved)
-    except NoWeightError:
-        return None
+    by_cheap = move_and_weight(replicate(population, copies), pair, observed, ratio)
+    chosen = by_mode(by_cheap, len(population))
+    return by_cheap.selected(chosen), chosen // copies
 
 
 def screened_draws(
@@ -119,7 +151,7 @@ def screened_draws(
     log_weights = _cheap_log_density(drawn, approximation) - proposed.log_prob
     many = Population(drawn, log_weights, approximation=approximation)
     few = many.selected(by_mode(many, trace.particles))
-    return few.reweighed(POSTERIOR(few.trace) - _cheap_log_density(few.trace, approximation))
+    return few.reweighed(_beyond(few.trace, approximation))
 
 
 def by_mode(population: Population, count: int) -> Tensor:
@@ -132,3 +164,8 @@ def _cheap_log_density(trace: Trace, approximation: Any) -> Tensor:
     cheap = [address for address, site in trace.distributions.items() if cost_of(site) < PHYSICS]
     likelihood: Tensor = approximation.log_likelihood(trace)
     return trace.log_prob(*cheap) + likelihood
+
+
+def _beyond(trace: Trace, approximation: Any) -> Tensor:
+    """Log ratio (N,) of the posterior to the cheap target: what physics says beyond it."""
+    return POSTERIOR(trace) - _cheap_log_density(trace, approximation)
