@@ -25,8 +25,8 @@ from bcppl.recordings.importers.bench.clocks import lateness
 from bcppl.recordings.importers.bench.log import imported
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # the logs are those that the tests are made of
-from tests.bench_logs import Log, truth, write
-from tests.touching_arms import TouchingArm, touching
+from tests.recordings.importers.bench_logs import Log, truth, write
+from tests.recordings.importers.touching_arms import TouchingArm, touching
 
 WITHIN = 0.05  # s: lateness is drawn from -50 to 50 ms
 BENDS = {"the structure yields by 20 um/N": 2e-5, "the structure does not yield": 0.0}

@@ -53,7 +53,7 @@ from bcppl.inference.targets import POSTERIOR
 from bcppl.sensors.likelihoods.bench_profiles import BenchProfile
 from bcppl.traces import generate
 from tests.calibration.case import AXES, DRAWS
-from tests.episode_errors import factors
+from tests.distributions.touches.episode_errors import factors
 
 HALF, HEIGHT, LENGTH = 0.03, 0.025, 0.05
 GAP = PegGap(block((2.0 * HALF, 2.0 * HALF, HEIGHT)), box_peg(0.016, LENGTH))

@@ -32,7 +32,7 @@ from tests.calibration.shared_errors import (
     without,
 )
 from tests.calibration.test_calibration import BROKEN, SEED, SOUND
-from tests.episode_errors import factors
+from tests.distributions.touches.episode_errors import factors
 
 ROUNDS, FEWER = 200, 120
 

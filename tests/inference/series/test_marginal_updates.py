@@ -1,0 +1,81 @@
+"""Traces of marginal series at other arguments and steps: whose estimates their filters are."""
+
+from __future__ import annotations
+
+import math
+
+import pyro
+import pyro.distributions as dist
+import torch
+from torch import Tensor
+
+from bcppl.inference.series import marginal
+from bcppl.traces import Series, extend, generate, update
+from tests.inference.series.linear_series import AUTOREGRESSION, observed
+from tests.invariance import number
+
+
+def pushed_step(state: dict[str, Tensor], push: float) -> dict[str, Tensor]:
+    x = pyro.sample("x", dist.Normal(state["rho"] * state["x"] + push, 0.5))
+    pyro.sample("y", dist.Normal(x, 0.5))
+    return {**state, "x": x}
+
+
+def pushed_start() -> dict[str, Tensor]:
+    return {
+        "rho": pyro.sample("rho", dist.Normal(number(0.0), 1.0)),
+        "x": pyro.sample("x", dist.Normal(number(0.0), 1.0)),
+    }
+
+
+def test_other_arguments_of_a_step_are_weighed_by_other_filters() -> None:
+    """The estimates of both steps are the new filters': the product is unbiased, its parts alone are not."""
+    torch.manual_seed(0)
+    program = marginal(Series(pushed_start, pushed_step), "rho", observed="y", particles=20)
+    rho, seen = torch.full((20_000,), 0.7, dtype=torch.float64), {"y/1": number(0.5), "y/2": number(2.0)}
+    trace, _ = generate(program, ([(0.0,), (0.0,)],), seen, len(rho), {"rho": rho})
+    before = trace.log_prob("y/1", "y/2")
+    moved = update(trace, args=([(0.0,), (1.0,)],))
+    after = moved.trace.log_prob("y/1", "y/2")
+    torch.testing.assert_close(moved.log_ratio, after - before)
+    # y has the mean (0, push) and x of the first step the variance .7^2 + .25.
+    first = 0.49 + 0.25
+    covariance = torch.tensor([[first + 0.25, 0.7 * first], [0.7 * first, 0.49 * first + 0.5]]).double()
+    for push, estimated in ((0.0, before), (1.0, after)):
+        y = torch.tensor([0.5, 2.0 - push], dtype=torch.float64)
+        exact = dist.MultivariateNormal(torch.zeros(2).double(), covariance).log_prob(y)
+        ratio = (estimated - exact).exp()
+        assert abs(float(ratio.mean() - 1.0)) < 4.0 * float(ratio.std()) / math.sqrt(len(rho)), push
+
+
+def test_two_continuations_of_one_trace_have_estimates_of_their_own() -> None:
+    torch.manual_seed(0)
+    program = marginal(Series(pushed_start, pushed_step), "rho", observed="y", particles=10)
+    trace, _ = generate(program, ([(0.0,)],), {"y/1": number(0.5)}, 50)
+    first = trace.log_prob("y/1")
+    longer = ([(0.0,), (0.0,)],)
+    ends = [extend(trace, longer, {"y/2": number(y)})[1] for y in (2.0, 2.0, -1.0)]
+    assert not bool((ends[0] == ends[1]).any()) and not bool((ends[0] == ends[2]).any())
+    assert torch.equal(trace.log_prob("y/1"), first)
+
+
+def test_a_trace_that_is_shortened_goes_on_with_other_filters() -> None:
+    torch.manual_seed(0)
+    program = marginal(AUTOREGRESSION, "rho", observed="y", particles=5)
+    trace, _ = generate(program, ([()] * 3,), observed(3), 40)
+    short = update(trace, args=([()] * 2,)).trace
+    short.log_prob()  # the filters run in the order of the steps
+    ends = [extend(short, ([()] * 3,), {"y/3": number(y)})[1] for y in (0.2, 0.2, -1.0)]
+    assert not bool((ends[0] == ends[1]).any()) and not bool((ends[0] == trace.log_prob("y/3")).any())
+
+
+def test_steps_may_observe_other_numbers_of_readings() -> None:
+    def read(state: dict[str, Tensor], count: int) -> dict[str, Tensor]:
+        pyro.sample("y", dist.Normal(state["rho"][..., None].expand(-1, count), 1.0).to_event(1))
+        return state
+
+    program = marginal(Series(pushed_start, read), "rho", observed="y", particles=3)
+    seen = {"y/1": torch.tensor([0.1, 0.2]).double(), "y/2": torch.tensor([0.3, 0.4, 0.5]).double()}
+    trace, _ = generate(program, ([(2,), (3,)],), seen, 6)
+    exact = sum(dist.Normal(trace["rho"][:, None], 1.0).log_prob(y).sum(1) for y in seen.values())
+    torch.testing.assert_close(trace.log_prob(*seen), exact)
