@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass, field, fields
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, NoReturn, overload
@@ -90,11 +91,14 @@ class Population:
     @cached_property
     def distinct(self) -> int:
         """How many particles with weight differ in some latent value; 1 of a program without any."""
+        return self.distinct_in(self.trace.choices)
+
+    def distinct_in(self, addresses: Collection[str]) -> int:
+        """The same of some latent addresses."""
         alive = self.log_weights > -torch.inf
         count = int(alive.sum())
-        columns = [
-            value[alive].reshape(count, value[0].numel()).double() for value in self.trace.choices.values()
-        ]
+        values = [value for address, value in self.trace.choices.items() if address in addresses]
+        columns = [value[alive].reshape(count, value[0].numel()).double() for value in values]
         columns = [column for column in columns if column.shape[1]]
         # Where one number tells all apart, as a continuous one does unless particles are copies: rows take
         # ten times as long to sort.

@@ -65,6 +65,9 @@ SEVERAL = 1800
 # them by .2 to 1 where touches tell them, and by less along a bent ridge such as a peg wedged in a hole
 # leaves. There particles died out along it from window to window, and what was left was sure of a part.
 DISPLACED, MOST_SWEEPS = 0.5, 6
+# Where physics decides about moves, and few particles were left to it, many of their copies stay where they
+# are: at the end of `peg_probe` a third were one. So as large a share of the poses is to differ, too.
+DISTINCT = 0.75
 
 
 def gaussian_pair(before: Any, after: Any, action: Any) -> Pair:
@@ -139,7 +142,12 @@ def guided(
         ancestors = by_mode(population, len(population))
         return population.selected(ancestors), ancestors
 
-    rejuvenation = resample_move(moves, sweeps, resample, always_move=True)
+    def until_distinct(trace: Trace) -> int | Until:
+        if isinstance(sweeps, Until) and runs_physics(trace):
+            return replace(sweeps, distinct=math.ceil(DISTINCT * trace.particles))
+        return sweeps
+
+    rejuvenation = resample_move(moves, until_distinct, resample, always_move=True)
 
     def cheaply(population: Population, target: Target) -> Moved:
         return moved_by(population, moves, target, sweeps)

@@ -48,8 +48,10 @@ class Until:
 
     def reached(self, start: Population, now: Population) -> bool:
         """Whether the criteria hold for a population that began at `start`."""
-        if self.distinct is not None and now.distinct < min(self.distinct, len(now)):
-            return False
+        if self.distinct is not None:
+            differ = now.distinct_in(self.of) if self.of else now.distinct
+            if differ < min(self.distinct, len(now)):
+                return False
         return self.displacement is None or bool((self.displaced(start, now) >= self.displacement).all())
 
     def displaced(self, start: Population, now: Population) -> Tensor:
@@ -79,7 +81,7 @@ def until(
         displacement: the weighted mean squared displacement since the start that every axis of every
             continuous latent value shall reach, as a share of its variance in the population. It is 2 for
             independent particles, and 0.5 where the correlation with the start is about 0.75.
-        of: the addresses of the latent values whose displacement counts; all unless given.
+        of: the addresses of the latent values that count; all unless given.
         most: the largest number of sweeps.
 
     Raises:

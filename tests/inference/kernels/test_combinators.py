@@ -238,6 +238,26 @@ def test_sweeps_until_particles_differ() -> None:
     assert not calls, "far enough already"
 
 
+def test_sweeps_until_particles_differ_in_what_is_named() -> None:
+    def program() -> None:
+        pyro.sample("x", dist.Normal(torch.tensor(0.0).double(), 1.0))
+        pyro.sample("y", dist.Normal(torch.tensor(0.0).double(), 1.0))
+
+    torch.manual_seed(6)
+    trace = simulate(program, (), 40)
+    population = Population(trace.at({"x": trace["x"][:1].expand(40)}))
+    assert population.distinct == 40
+    assert [population.distinct_in(names) for names in (("x",), ("y",), ("x", "y"))] == [1, 40, 40]
+    for of, least in (((), 1), (("x",), 35)):
+        kernel = metropolis_hastings(drift("y"))
+        rest = moved_by(population, kernel, POSTERIOR, until(distinct=35, of=of, most=3)).population
+        assert (rest is population) == (not of), "only what is named is waited for"
+        done = moved_by(
+            population, sequence([kernel, SHORT]), POSTERIOR, until(distinct=35, of=of)
+        ).population
+        assert done.distinct_in(("x",)) >= least
+
+
 def test_sweeps_until_the_start_is_left_behind_and_no_longer_than_allowed() -> None:
     torch.manual_seed(4)
     population = copies(200, 200)
