@@ -66,7 +66,7 @@ SEVERAL = 1800
 # leaves. There particles died out along it from window to window, and what was left was sure of a part.
 DISPLACED, MOST_SWEEPS = 0.5, 6
 # Where physics decides about moves, and few particles were left to it, many of their copies stay where they
-# are: at the end of `peg_probe` a third were one. So as large a share of the poses is to differ, too.
+# are, as at the end of `peg_probe`. So as large a share of the poses is to differ, too.
 DISTINCT = 0.75
 
 

@@ -150,6 +150,11 @@ def test_where_physics_says_much_beyond_the_cheap_likelihood_it_is_not_divided_o
         raise AssertionError("nothing is moved")
 
     assert screened_and_moved(*given, moves, 59.0) is None
+    fresh = Population(simulate(program, (0,), 60), approximation=Cheap(1))
+    first = Observed((1,), {"felt_0": torch.tensor(SEEN[0]).double()})
+    unmoved = (fresh, Cheap(0), first, Pair(around(0.009, 0.015), around(0.0, 0.02)))
+    assert screened_and_moved(*unmoved, lambda population, _: Moved(population, 1.0), 59.0) is None
+    assert screened_and_moved(*unmoved, lambda population, _: Moved(population, 1.0), 1.0) is not None
 
 
 def test_only_those_that_survive_are_simulated() -> None:

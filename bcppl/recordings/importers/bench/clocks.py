@@ -157,7 +157,10 @@ def lateness(force: Stream, position: Stream, within: float, drifts: bool = Fals
     if spread > _KNOWN or most[far].max(initial=0.0) > _RIVAL * most[~far].max(initial=0.0):
         return None
     own = separate.reshape(len(felt), len(every), -1).max(axis=2)
-    contradicts = own[:, far].max(axis=1, initial=-np.inf) > own[:, ~far].max(axis=1) + _IMPROBABLE
+    expected = np.clip(late + drift * (times - middle), every[0], every[-1])
+    apart = np.abs(every - expected[:, None]) > max(_FAR, 3.0 * spread)
+    best_near, best_apart = (np.where(where, own, -np.inf).max(axis=1) for where in (~apart, apart))
+    contradicts = best_apart > best_near + _IMPROBABLE
     return Lateness(
         late=float(late),
         spread=spread,
