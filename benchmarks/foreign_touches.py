@@ -1,6 +1,6 @@
 """How accurate and how honest the default inference is in a world that it was not made with.
 
-Every scene of `foreign_world` is touched in two manners, by a contact softer and one stiffer than nominal,
+Every scene of `foreign.world` is touched in two manners, by a contact softer and one stiffer than nominal,
 and read at two rates: eight recordings of the same two views. `--cuts` reads each probe at other rates and
 cuts it into other windows, of which the belief should not depend; `--faults` shows which faults are reported.
 `--check` prints the gap between peg and part at the true pose, from which a wrong recording would show. With
@@ -19,11 +19,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import foreign_check
 import numpy as np
 import torch
-from foreign_faults import FAULTS, recut, resampled
-from foreign_world import CONTACTS, MANNERS, RATES, kept, scene_of
+from foreign import check
+from foreign.faults import FAULTS, recut, resampled
+from foreign.world import CONTACTS, MANNERS, RATES, kept, scene_of
 from report import Row, finish, options, show
 from scenes import model
 
@@ -212,9 +212,9 @@ def rows_of(results: Sequence[Result]) -> list[Row]:
     return [row._replace(value=math.nan) if math.isinf(row.value) else row for row in rows]
 
 
-def checked(case: Case, folder: Path | None) -> foreign_check.Gaps:
+def checked(case: Case, folder: Path | None) -> check.Gaps:
     """The gaps of one recording."""
-    return foreign_check.gaps_of(kept(*case[:4], folder))
+    return check.gaps_of(kept(*case[:4], folder))
 
 
 def asked() -> argparse.Namespace:
@@ -248,8 +248,8 @@ def main() -> None:
         for kind in kinds:
             cases = [Case(seed, *kind) for seed in seeds]
             several = list(in_order(partial(checked, folder=given.keep), cases, given.jobs))
-            lines.append([f"{kind[0]}, {kind[1]}, {kind[2]} Hz", *foreign_check.summary(several)])
-        show("gap between peg and part at the true pose", ["", *foreign_check.COLUMNS], lines)
+            lines.append([f"{kind[0]}, {kind[1]}, {kind[2]} Hz", *check.summary(several)])
+        show("gap between peg and part at the true pose", ["", *check.COLUMNS], lines)
         return
     # Kinds of one scene one after another: an interrupted run has all kinds of the scenes that it got to.
     changes = [f"{hertz} Hz, {seconds:g} s" for hertz, seconds in CUTS] if given.cuts else [""]

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from foreign_faults import part_mirrored, part_moved, part_turned, truth_outside
+from foreign.faults import part_mirrored, part_moved, part_turned, truth_outside
 from report import Row, finish, options, show
 from scenes import PARTICLES, followed, model
 from touches import LOGS, pushes

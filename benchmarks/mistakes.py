@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from foreign_faults import mapped, part_mirrored, part_moved, truth_outside
+from foreign.faults import mapped, part_mirrored, part_moved, truth_outside
 from honesty import symmetric
 from report import Row, finish, options, show
 from scenes import PARTICLES, default_run

@@ -1,6 +1,6 @@
 """How accurate and how honest the belief is when something happens that the model does not have.
 
-A scene of the foreign world is seen and pressed at seven places with a mechanism of `foreign_mechanisms`, and
+A scene of the foreign world is seen and pressed at seven places with a mechanism of `foreign.mechanisms`, and
 explained under the profile of a bench. Two poses are asked for: the part's in the world, as it was before any
 touch, and the part's as seen from the held peg where an insertion would start after all touches. Deviations
 are in standard deviations of the belief, by its covariance. With `--file` results are written as they are
@@ -18,8 +18,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from foreign_mechanisms import MECHANISMS, made
-from foreign_world import scene_of
+from foreign.mechanisms import MECHANISMS, made
+from foreign.world import scene_of
 from report import Row, finish, options, show
 from scenes import PARTICLES, default_run, quantile
 from torch import Tensor

@@ -12,12 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bcppl.arrays import Array
-from bcppl.contact.mujoco_model import (
-    SENSOR_COLUMNS,
-    ContactParameters,
-    build_model,
-)
+from bcppl.contact.mujoco_model import SENSOR_COLUMNS, ContactParameters, build_model
 from bcppl.contact.stepping import POSE, WRENCH, SimulationState, Stepper
+from bcppl.errors import InputError
 from bcppl.geometry.parts import Part
 from bcppl.models.worlds.bench.reality import BenchReality, held
 from bcppl.robot.execution import Executor
@@ -84,12 +81,11 @@ def execute(
         error: (T, 6) of the measured wrench at the stamps: bias, drift and noise, N and N m.
         stop_at_hole: whether the execution ends when a search has found its hole.
         after: the execution just before it, whose final position and velocity are the initial ones.
-        tare: (3,) N, the sensor's reading without contact; by default the mean of the first ten samples,
-            during which no motion is stopped.
+        tare: (3,) N, the sensor's reading without contact; by default the mean of the first ten samples.
         reality: in which the robot is wrong, and whose slips continue; by default it is right.
 
     Raises:
-        InputError: as of `bcppl.robot.execution.Executor`.
+        InputError: as of `bcppl.robot.execution.Executor`, or the peg is not at rest while it is tared.
     """
     executor = Executor(plan, tare=tare, stop_at_hole=stop_at_hole)
     stamps = executor.probe.stamps
@@ -129,6 +125,8 @@ def execute(
         force = felt(k + 1)[-1, :3] + error[k, :3]
         if executor.sample(force, functools.partial(read, k)):
             stepper = Stepper(model, reality.driven(executor.probe), contact.time_step)
+    if executor.state == "aborted":
+        raise InputError(executor.reason)
     count = executor.taken
     rows = rows[:count]
     return Execution(

@@ -162,6 +162,13 @@ def test_free_motion_has_no_contact_force_and_stops_no_guarded_motion() -> None:
     np.testing.assert_array_equal(one.probe.command, other.probe.command)
 
 
+def test_a_plan_that_is_in_contact_while_the_wrench_is_tared_is_refused() -> None:
+    lowered = plan_of(scene(), until=6)
+    lowered.world_from_peg[:, 2] -= 0.030  # the tip begins at the top, and is driven into it
+    with pytest.raises(InputError, match="while it was tared"):
+        scene().execute(replace(lowered, manners=("free",) * 5))
+
+
 @pytest.mark.parametrize("part", ["square 8 mm", "hexagon 12 mm", "rectangular tray"])
 def test_a_guarded_press_ends_at_its_force_and_a_held_slide_continues_from_there(part: str) -> None:
     one, plan = scene(0, part), plan_of(scene(0, part))

@@ -10,10 +10,8 @@ from scipy.spatial.transform import Rotation
 from bcppl.recordings import problems
 
 sys.path.insert(0, str(Path(__file__).parents[3] / "benchmarks"))
-import foreign_check as check
-import foreign_mechanisms as mechanisms
-import foreign_world as world
-from foreign_arm import composed, inverse
+from foreign import check, mechanisms, world
+from foreign.arm import composed, inverse
 
 SEED = 1  # contacts stiffer than nominal: pressed in by less than 10 um
 EVERY = 60  # ticks between pressed stamps that are checked

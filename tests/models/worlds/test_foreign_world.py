@@ -12,9 +12,7 @@ from bcppl.errors import InputError
 from bcppl.recordings import problems
 
 sys.path.insert(0, str(Path(__file__).parents[3] / "benchmarks"))
-import foreign_check as check
-import foreign_faults as faults
-import foreign_world as world
+from foreign import check, faults, world
 
 TICKS = 10  # of the controller between stamps at 100 Hz
 

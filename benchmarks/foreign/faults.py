@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from foreign_world import windows
 from scipy.ndimage import label, median_filter
 from scipy.spatial.transform import Rotation
 
@@ -17,6 +16,7 @@ from bcppl.geometry.parts import Part, Piece
 from bcppl.sensors.depth import DepthImage, View
 from bcppl.sensors.measurements import Measurement, Recording
 from bcppl.sensors.probe import Probe, ProbeWindow, Touch
+from foreign.world import windows
 
 Fault = Callable[[Recording], Recording]
 

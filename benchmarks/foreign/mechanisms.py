@@ -19,14 +19,14 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from foreign_arm import Log, composed, inverse
-from foreign_parts import LENGTH
-from foreign_world import TICK, Scene, log_of, recording_of
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from bcppl.arrays import Array
 from bcppl.sensors.measurements import Recording
+from foreign.arm import Log, composed, inverse
+from foreign.parts import LENGTH
+from foreign.world import TICK, Scene, log_of, recording_of
 
 SINGLE = ("grasp", "creep", "slide", "small_slides", "backlash", "rough_kinematics", "late_wrench")
 MECHANISMS = {
@@ -70,7 +70,7 @@ class Trace(NamedTuple):
 
 
 class Reality:
-    """Where peg and part really are while a scene is touched, as mechanisms change it (`foreign_arm.Hidden`).
+    """Where peg and part really are while a scene is touched, as mechanisms change it (`foreign.arm.Hidden`).
 
     Attributes:
         stated_from_peg, world_from_part: (7,) as they are now.
@@ -297,7 +297,7 @@ def made(scene: Scene, mechanism: str) -> Made:
         wrench = np.concatenate([np.tile(wrench[:1], (LATE, 1)), wrench[:-LATE]])
     sensed = log._replace(world_from_peg=measured(poses), wrench=wrench)
     recording = recording_of(scene, "presses", contact, RATE, sensed)
-    source = f"simulated by benchmarks/foreign_mechanisms.py, seed {scene.seed}, {mechanism}, {contact}"
+    source = f"simulated by benchmarks/foreign/mechanisms.py, seed {scene.seed}, {mechanism}, {contact}"
     stated = insertion_start(reality.world_from_part, HOLES[scene.foreign.part.name])
     world_from_peg = measured(stated[None])[0]
     part_from_peg = composed(inverse(reality.world_from_part), composed(stated, reality.stated_from_peg))

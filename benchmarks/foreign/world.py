@@ -14,9 +14,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from foreign_arm import NOMINAL, Hidden, Log, Mechanics, Motion, carried_out
-from foreign_parts import LENGTH, PARTS, ForeignPart, Place, peg
-from foreign_views import perturbed, views
 from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 
@@ -25,6 +22,9 @@ from bcppl.geometry.parts import Guess, Part
 from bcppl.recordings import load, save
 from bcppl.sensors.measurements import Measurement, Recording
 from bcppl.sensors.probe import Probe, ProbeWindow, Touch
+from foreign.arm import NOMINAL, Hidden, Log, Mechanics, Motion, carried_out
+from foreign.parts import LENGTH, PARTS, ForeignPart, Place, peg
+from foreign.views import perturbed, views
 
 MANNERS = {"taps": (6, 6.0), "presses": (7, 12.0)}  # how many, within how many seconds
 CONTACTS = {"softer": (-1.0, 0.0), "stiffer": (0.0, 1.0)}  # log10 of a contact's stiffness over the nominal
@@ -150,7 +150,7 @@ def recording_of(
         background=scene.background,
         truth=scene.truth,
         model="look_and_touch",
-        source=f"simulated by benchmarks/foreign_world.py, seed {scene.seed}, {manner}, {contact}",
+        source=f"simulated by benchmarks/foreign/world.py, seed {scene.seed}, {manner}, {contact}",
     )
 
 
