@@ -10,11 +10,10 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from scenes import Curve, Probed, followed, quantile
 
 from bcppl.figures import add_over_time
-from bcppl.figures.over_time import SMALLEST_ADD
+from bcppl.figures.over_time import SMALLEST_ADD, logarithmic_axis
 from bcppl.figures.palette import PARTICLE, STRONG, TRUTH
 
 REPORTED = 0.8  # mm, the ADD that the paper reports with 75 particles after a 6 s probe
@@ -50,14 +49,7 @@ def of_all(found: Sequence[Probed], beside: Sequence[float], what: str, file: Pa
         axes.axhline(add, color=TRUTH, linewidth=1.0, linestyle="--")
     axes.axvspan(0.0, max(times), color="#0072B2", alpha=0.06, linewidth=0)
     axes.text(0.0, 1.01, " probing", transform=axes.get_xaxis_transform(), color="#0072B2")
-    axes.set_yscale("log")
-    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=20))
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.yaxis.set_minor_formatter(NullFormatter())
-    axes.grid(axis="y", color="0.9")
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.set_ylabel("ADD, weighted by particles (mm)")
+    logarithmic_axis(axes, "ADD, weighted by particles (mm)")
     axes.set_xlabel("time of the probe (s)")
     first = curves[0]
     ticks = [(p, k) for p, k, t in zip(places(first), first.kinds, first.times, strict=True) if math.isnan(t)]

@@ -20,6 +20,18 @@ from bcppl.figures.palette import PARTICLE, SEEN, STRONG
 SMALLEST_ADD = 0.01  # mm: below it a logarithmic axis shows nothing of interest
 
 
+def logarithmic_axis(axes: Axes, label: str) -> None:
+    """A vertical axis for errors: logarithmic, with ticks at 1, 2 and 5 and lines at them."""
+    axes.set_yscale("log")
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=20))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.yaxis.set_minor_formatter(NullFormatter())
+    axes.grid(axis="y", color="0.9")
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.set_ylabel(label)
+
+
 def add_over_time(
     times: Array, adds: Array, weights: Array, labels: Sequence[str], contact_start: int | None = None
 ) -> Figure:
@@ -68,14 +80,7 @@ def add_over_time(
         fontweight="bold",
     )
 
-    axes.set_yscale("log")
-    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=20))
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.yaxis.set_minor_formatter(NullFormatter())
-    axes.grid(axis="y", color="0.9")
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.set_ylabel("ADD (mm)")
+    logarithmic_axis(axes, "ADD (mm)")
     axes.set_xlabel("after measurement")
     crowded = sum(len(label) for label in labels) > 70
     axes.set_xticks(times, labels, rotation=45 if crowded else 0, ha="right" if crowded else "center")
