@@ -15,8 +15,8 @@ PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 
 help:
 	@echo "make run          estimate the part's pose in the shipped recordings; beliefs and figures go to runs/"
-	@echo "make test         style, types and tests"
-	@echo "make long         the tests that take minutes"
+	@echo "make test         style, types and the quick tests"
+	@echo "make long         the other tests: seconds to minutes each"
 	@echo "make docs         the documentation as a site, in build/docs: open build/docs/index.html"
 	@echo "make notebooks    execute the notebooks in place; their outputs are kept (NOTEBOOKS=series for one)"
 	@echo "make peers        environments of the packages that the benchmarks compare with, in benchmarks/.peers"
@@ -40,7 +40,7 @@ lint: $(STAMP)
 	$(BIN)/mypy
 
 long: $(STAMP)
-	$(PYTEST) -m long
+	$(PYTEST) -m long -n $(JOBS) --dist loadfile --no-loadscope-reorder
 
 # Warnings are errors. Pages that have not changed are not made again.
 docs: $(DOCS)

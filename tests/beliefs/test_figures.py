@@ -183,6 +183,7 @@ def over_the_box() -> tuple[Camera, np.ndarray, np.ndarray]:
     return camera, pose, depth
 
 
+@pytest.mark.long
 def test_the_outline_is_where_the_part_is_seen_and_the_residual_is_measured_minus_rendered() -> None:
     camera, pose, depth = over_the_box()
     axes = Figure().add_subplot()
@@ -224,6 +225,7 @@ def test_forces_are_tared_and_contact_is_marked_where_it_is_felt() -> None:
     rendered(seen.figure)
 
 
+@pytest.mark.long
 def test_the_gap_by_a_belief_is_drawn_in_millimetres_with_what_was_felt() -> None:
     times = np.arange(100) / 100.0
     pose = np.tile([0.5, 0.1, 0.05, 1.0, 0.0, 0.0, 0.0], (100, 1))

@@ -120,6 +120,7 @@ def test_a_region_is_as_flat_as_its_particles() -> None:
     assert not bool(region.contains(poses.retract(region.center, column(0, 1e-6, 0, 0, 0, 0))))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("weighted", [False, True])
 def test_regions_hold_a_fresh_draw_as_often_as_they_say(weighted: bool) -> None:
     torch.manual_seed(3)

@@ -82,6 +82,7 @@ def test_ranks_count_what_lies_below_and_break_ties_at_random() -> None:
 # ---- few rounds, with a loose bound, in the ordinary tests
 
 
+@pytest.mark.long
 def test_a_few_rounds_are_calibrated_and_a_flipped_sign_is_not() -> None:
     assert ranked("depth, quick", None, 4, processes=1).corrected > LOOSE
     assert ranked("depth, quick", "sign flipped", 3, processes=1).corrected < LOOSE

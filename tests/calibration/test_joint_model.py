@@ -37,6 +37,7 @@ from tests.distributions.touches.episode_errors import factors
 ROUNDS, FEWER = 200, 120
 
 
+@pytest.mark.long
 def test_what_is_simulated_has_the_residuals_of_the_likelihood() -> None:
     """Whitened gaps at the truth are standard normal, and are not where an error is left out.
 
@@ -65,6 +66,7 @@ def test_what_is_simulated_has_the_residuals_of_the_likelihood() -> None:
         assert medians[error.name] > 1.5 * medians["nothing"], error.name
 
 
+@pytest.mark.long
 def test_likelihoods_are_those_of_what_is_simulated() -> None:
     """Without any inference: the truth ranks like any pose that could be exchanged with it."""
     found = kstest([rank_among_alike(seed) for seed in range(40)], "uniform").pvalue

@@ -88,6 +88,7 @@ def test_one_of_several_holes_is_chosen(planned: Callable) -> None:
         assert ran.code == 2 and message in ran.err, ran.err
 
 
+@pytest.mark.long
 def test_an_insertion_that_an_arm_cannot_follow_is_refused(planned: Callable) -> None:
     part = block_with_hole(OUTLINE, (0.06, 0.06, 0.025))
     world_from_part = about((0.5, 0.0, 0.15, 1.0, 0.0, 0.0, 0.0), (1e-4,) * 3 + (0.0,) * 3)

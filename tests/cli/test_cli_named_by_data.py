@@ -114,6 +114,7 @@ def test_check_reports_a_recording_that_names_a_file(
     assert bcppl("check", "fine.h5").code == 0
 
 
+@pytest.mark.long
 def test_a_file_on_the_command_line_is_run(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
     save(push(), tmp_path / "push.h5")
     (tmp_path / "mine.py").write_text(OWN)

@@ -18,6 +18,7 @@ from bcppl.sensors import Measurement, sensor_named
 from tests.command_line import FEW_MOVES, Ran, short
 
 
+@pytest.mark.long
 def test_a_new_model_runs_and_takes_its_setting(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
     assert bcppl("new", "model", "mine").code == 0
     save(short(1), tmp_path / "push.h5")
@@ -27,6 +28,7 @@ def test_a_new_model_runs_and_takes_its_setting(bcppl: Callable[..., Ran], tmp_p
     assert json.loads((tmp_path / "runs/push/run.json").read_text()) == first
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["proposal", "kernel"])
 def test_a_new_inference_program_runs(bcppl: Callable[..., Ran], tmp_path: Path, kind: str) -> None:
     assert bcppl("new", kind, "mine.py").code == 0

@@ -32,6 +32,7 @@ from tests.made_recordings import assert_one_sentence
 SETTINGS = "--model", "look_and_touch", "--inference", "guided_smc", "--particles", 30
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("hidden", [False, True])
 def test_a_hidden_view_is_marked_and_named_and_a_clean_one_is_not(
     hidden: bool, bcppl: Callable[..., Ran], tmp_path: Path
@@ -73,6 +74,7 @@ model = Model(program, prepare, observe, "part")
 """
 
 
+@pytest.mark.long
 def test_a_model_without_a_check_has_no_p_values(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
     save(short(1), tmp_path / "short.h5")
     (tmp_path / "unchecked.py").write_text(UNCHECKED)

@@ -77,6 +77,7 @@ def ranked(ran: Ran) -> list[tuple[str, float]]:
     return [(name, float(gain)) for name, gain in rows]
 
 
+@pytest.mark.long
 def test_a_recording_is_run_ranked_and_its_best_action_written(
     bcppl: Callable[..., Ran], here: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -102,6 +103,7 @@ def test_a_recording_is_run_ranked_and_its_best_action_written(
     assert np.array_equal(again.world_from_peg, best.world_from_peg)
 
 
+@pytest.mark.long
 def test_views_and_touches_are_ranked_together_and_other_models_by_reweighting(
     bcppl: Callable[..., Ran], here: Path
 ) -> None:

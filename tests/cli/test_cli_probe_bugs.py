@@ -66,6 +66,7 @@ def assert_reported_as_a_bug(message: str, error: Exception) -> None:
     assert "something went wrong" in message and type(error).__name__ in message and "a bug" in message
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("error", BUGS, ids=lambda error: type(error).__name__)
 def test_a_bug_in_the_ranking_is_no_unsuitable_model(
     error: Exception, error_of: Callable[..., str], monkeypatch: pytest.MonkeyPatch
@@ -75,6 +76,7 @@ def test_a_bug_in_the_ranking_is_no_unsuitable_model(
     assert_reported_as_a_bug(error_of(), error)
 
 
+@pytest.mark.long
 def test_a_bug_deep_within_the_ranking_is_no_unsuitable_model(
     error_of: Callable[..., str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -37,6 +37,7 @@ def content(path: Path) -> dict[str, np.ndarray]:
         return {**arrays, "log_evidence": np.array(file.attrs["log_evidence"])}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("count", [0, 1, 3])
 def test_a_run_that_is_killed_goes_on_to_the_same_bits(
     count: int, bcppl: Callable[..., Ran], tmp_path: Path
@@ -75,6 +76,7 @@ def test_a_run_that_is_killed_goes_on_to_the_same_bits(
     assert len(table) == 3 and table == shown
 
 
+@pytest.mark.long
 def test_what_a_folder_holds_is_never_written_over(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
     save(short(1), tmp_path / "short.h5")
     words = ("run", "short.h5", "--particles", 4, "--inference", FEW_MOVES)
@@ -116,6 +118,7 @@ def test_what_cannot_be_resumed_is_refused(bcppl: Callable[..., Ran], tmp_path: 
     assert "run.json is no valid JSON" in bcppl("run", "--resume", "out").err
 
 
+@pytest.mark.long
 def test_an_inference_program_without_start_is_named(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
     (tmp_path / "plain.py").write_text(
         "from tests.few_moves import infer as whole\n"

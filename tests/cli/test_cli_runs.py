@@ -22,6 +22,7 @@ from bcppl.recordings.beliefs import load_belief, load_latent
 from tests.command_line import FEW_MOVES, PROBE, SHIPPED, Ran, short
 
 
+@pytest.mark.long
 def test_a_users_own_files_are_taken_as_readily_as_names(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
     mine = (
         PROBE.read_text().replace('f"onset_{k}"', 'f"begin_{k}"').replace("def point_probe(", "def my_probe(")
@@ -49,6 +50,7 @@ def test_a_users_own_files_are_taken_as_readily_as_names(bcppl: Callable[..., Ra
     ]
 
 
+@pytest.mark.long
 def test_the_same_seed_writes_the_same_beliefs(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
     save(short(2), tmp_path / "short.h5")
     for out, seed in (("a", 1), ("b", 1), ("c", 2)):
@@ -67,6 +69,7 @@ STOPS = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("error", STOPS)
 def test_what_was_computed_before_a_stop_is_kept(
     error: str, bcppl: Callable[..., Ran], tmp_path: Path
@@ -97,6 +100,7 @@ def test_what_was_computed_before_a_stop_is_kept(
     assert "push 2" in ran.out and "standard deviation" in ran.out
 
 
+@pytest.mark.long
 def test_what_a_folder_holds_of_others_is_left_as_it_is(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
     save(short(1), tmp_path / "short.h5")
     (tmp_path / "out").mkdir()
@@ -199,6 +203,7 @@ def test_every_latent_site_comes_out(bcppl: Callable[..., Ran], tmp_path: Path) 
     assert "empty" not in ran.out  # a column without numbers needs no words
 
 
+@pytest.mark.long
 def test_a_model_of_the_pose_alone_prints_no_other_sites(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
     for name, truth in (("known", short(1).truth), ("unknown", None)):
         save(dataclasses.replace(short(1), truth=truth), tmp_path / f"{name}.h5")
@@ -228,6 +233,7 @@ def test_the_bar_names_the_measurement_in_progress() -> None:
     assert [next_label(short(3), taken) for taken in range(1, 5)] == ["push 1", "push 2", "push 3", "push 3"]
 
 
+@pytest.mark.long
 def test_a_run_keeps_its_warnings_and_explains_touches(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
     """Pushes of a finger have no peg that could be turned: no hypothesis is compared, which is stated."""
     save(short(1), tmp_path / "short.h5")
@@ -238,6 +244,7 @@ def test_a_run_keeps_its_warnings_and_explains_touches(bcppl: Callable[..., Ran]
     assert record["explanations"] == [] and isinstance(record["warnings"], list)
 
 
+@pytest.mark.long
 def test_settings_of_the_model_reach_the_run_and_the_next_probe(
     bcppl: Callable[..., Ran], tmp_path: Path
 ) -> None:
@@ -276,6 +283,7 @@ def test_a_setting_that_cannot_be_is_refused(setting: str, bcppl: Callable[..., 
     assert REFUSED[setting] in ran.err and len(ran.err.strip().splitlines()) == 1
 
 
+@pytest.mark.long
 def test_a_model_without_settings_is_given_none(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
     save(short(1), tmp_path / "short.h5")
     (tmp_path / "plain.py").write_text(

@@ -7,6 +7,8 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
+
 from bcppl.recordings import save
 from bcppl.recordings.beliefs import load_belief
 from tests.command_line import FEW_MOVES, Ran, short
@@ -14,6 +16,7 @@ from tests.command_line import FEW_MOVES, Ran, short
 WORDS = ("--inference", FEW_MOVES, "--particles", 8, "--out", "found")
 
 
+@pytest.mark.long
 def test_each_combination_is_run_once_and_reads_as_a_table(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
     save(short(1), tmp_path / "one.h5")
     save(short(2), tmp_path / "two.h5")
@@ -36,6 +39,7 @@ def test_each_combination_is_run_once_and_reads_as_a_table(bcppl: Callable[..., 
         assert json.loads(row["mean"]) == belief.mean.tolist()
 
 
+@pytest.mark.long
 def test_a_run_is_the_same_as_of_the_command_run(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
     save(short(2), tmp_path / "two.h5")
     assert bcppl("sweep", "two.h5", "--seeds", 3, "--jobs", 2, *WORDS).code == 0

@@ -77,6 +77,7 @@ def test_what_is_kept_is_not_evaluated_again_and_what_failed_is(tmp_path: Path) 
     assert file.read_text().startswith(before) and len(file.read_text().splitlines()) == 4
 
 
+@pytest.mark.long
 def test_a_process_that_dies_takes_no_other_result_with_it() -> None:
     found = dict(as_they_end(dying, range(12), 2))
     assert "SIGKILL" in found.pop(3).reason  # type: ignore[union-attr]
@@ -84,6 +85,7 @@ def test_a_process_that_dies_takes_no_other_result_with_it() -> None:
     assert list(in_order(lambda k: k + 1, range(5), 2)) == [1, 2, 3, 4, 5]
 
 
+@pytest.mark.long
 def test_a_sweep_that_is_killed_goes_on(tmp_path: Path) -> None:
     file = tmp_path / "results.jsonl"
     command = [sys.executable, "-c", SLOW, str(file)]

@@ -152,6 +152,7 @@ def test_it_is_mujocos_contact_distance_between_boxes() -> None:
     assert beside_it.sum() > 5 and np.all(ours[beside_it] < others[beside_it] + 1e-5)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["round tray", "D 10 mm", "hexagon 12 mm"])
 def test_pegs_in_and_over_the_holes_of_the_bench_touch_where_mujocos_do(name: str) -> None:
     """Part and peg in many convex pieces, near contact in the hole, on its rim and on the top."""
@@ -207,6 +208,7 @@ def test_pegs_that_lean_in_a_hole_are_as_far_from_its_walls_as_by_mujoco() -> No
     assert off.max() < 1e-7 and off.min() > -5e-5 and (np.abs(off) < 1e-7).mean() > 0.75
 
 
+@pytest.mark.long
 def test_a_grid_that_knows_how_inexact_it_is_gives_the_same_gaps_with_fewer_searches() -> None:
     gap = PegGap(bench_part("round tray").part, peg_for(round_outline(0.008), 0.0005, 0.05))
     pegs = torch.cat([anyhow(40, 3, 0.02), anyhow(200, 4, 0.03)])
@@ -231,6 +233,7 @@ def test_centred_in_a_round_hole_it_is_half_the_clearance() -> None:
     assert np.all(np.abs(distance - 0.5 * clearance + np.abs(off)) < 0.012 * np.abs(off) + 1e-8)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("facets", ["coarse", "fine"])
 def test_flat_sides_touch_a_ball_and_a_cylinder_however_finely_these_are_meshed(facets: str) -> None:
     """At no vertex of the peg, and at edges that are as shallow as the meshes are fine."""

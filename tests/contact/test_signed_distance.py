@@ -33,6 +33,7 @@ def points_about(part: Part, count: int) -> np.ndarray:
     return np.concatenate([inside, corners.mean(axis=1), corners[:, 0], corners[:, :2].mean(axis=1)])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["sphere", *PARTS])
 def test_distances_are_those_of_libigl_and_negative_inside(name: str) -> None:
     part = part_of(name)
@@ -51,6 +52,7 @@ def test_distances_are_those_of_libigl_and_negative_inside(name: str) -> None:
     np.testing.assert_allclose(found.normal.norm(dim=1), 1.0, atol=1e-9)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", PARTS)
 def test_interpolation_is_nowhere_farther_off_than_the_grid_states(name: str) -> None:
     part = part_of(name)

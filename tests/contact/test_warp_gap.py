@@ -35,6 +35,7 @@ def about_a_hole(name: str) -> tuple[Part, Part, Tensor]:
     return kind.part, kind.peg(0.0005), poses.compose(torch.from_numpy(kind.part_from_hole), away)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", PLACES)
 def test_near_contact_it_is_that_of_the_processor_and_farther_away_to_a_grid(name: str) -> None:
     part, peg, stood = about_a_hole(name)
@@ -61,6 +62,7 @@ def test_one_peg_for_each_part_and_none_at_all() -> None:
     assert gap(where, stood[:0]).distance.shape == (3, 0)
 
 
+@pytest.mark.long
 def test_a_recording_ends_at_the_same_belief() -> None:
     recording = load_recording("peg_probe")
     ends = []

@@ -22,6 +22,7 @@ def correlated() -> Tensor:
     return scale @ mixed @ mixed.T @ scale
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("shift", [0.0, 0.012, -0.03])
 def test_its_density_is_that_of_its_draws(shift: float) -> None:
     """Reweighed to the normal, draws in the box give the normal's chance of lying in it, also far out."""

@@ -45,6 +45,7 @@ def depths(cells: int) -> Tensor:
     return 0.2 + 0.6 * (torch.arange(cells, dtype=torch.float64) + 0.5) / cells
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("place", [(0.0, 0.0, 0.0), (0.055, 0.0, 0.0), (5.0, 0.0, 0.0)])
 @pytest.mark.parametrize("rim", [0, 1])
 def test_rows_are_a_density(place: tuple[float, float, float], rim: int) -> None:
@@ -58,6 +59,7 @@ def test_rows_are_a_density(place: tuple[float, float, float], rim: int) -> None
     assert 0.96 < volume < 1.01
 
 
+@pytest.mark.long
 def test_draws_follow_the_density_of_rows() -> None:
     """The mean of p'/p over draws from p is 1, whatever p' is; here the part elsewhere."""
     torch.manual_seed(0)

@@ -66,6 +66,7 @@ def test_a_recording_s_guess_has_tails() -> None:
     assert -7.0 < float(outside) < -4.0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("beside", [0.0, 0.019, 0.024, 0.04])
 def test_proposals_are_the_normal_times_the_prior(beside: float) -> None:
     """Their density, reweighed to normal times prior, integrates to what draws of the normal give."""

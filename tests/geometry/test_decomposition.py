@@ -110,6 +110,7 @@ def test_pieces_are_cached_by_content_and_damage_is_reported(
     assert len(list(tmp_path.iterdir())) == 3
 
 
+@pytest.mark.long
 def test_a_decomposition_coarser_than_the_clearance_allows_is_refused(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

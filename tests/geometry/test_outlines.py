@@ -39,6 +39,7 @@ def volume_of_union(part: Part) -> float:
     return float(trimesh.boolean.union([solid_of(piece) for piece in part.pieces], engine="manifold").volume)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", NAMED)
 def test_a_block_and_its_peg_are_exactly_their_outlines(name: str) -> None:
     hole = named_outline(name, 0.0161)
@@ -90,6 +91,7 @@ def test_a_peg_that_slides_over_the_top_catches_on_no_seam(monkeypatch: pytest.M
     assert abs(caught - smooth)[:, :2].max() > 15e-6
 
 
+@pytest.mark.long
 def test_a_stepped_part_with_a_chamfered_bore_is_exactly_its_prisms_along_any_axis() -> None:
     cylinder, cone = trimesh.creation.cylinder, trimesh.creation.cone
     foot = trimesh.creation.box([0.05, 0.04, 0.005])
@@ -115,6 +117,7 @@ def test_a_stepped_part_with_a_chamfered_bore_is_exactly_its_prisms_along_any_ax
         prismatic(part, axis="y")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("shape", SHAPES)
 def test_the_shipped_trays_and_pegs_are_within_5_um_of_their_meshes(shape: str) -> None:
     for part in (insert_tray(shape), insert_peg(shape)):

@@ -57,6 +57,7 @@ def seen():
     return scene, list(scenes.default_run(scene.look(), FEW, 0))
 
 
+@pytest.mark.long
 def test_touches_after_vision_are_those_of_one_run_to_the_bit(seen):
     scene, vision = seen
     whole = scene.probe(three_two_one(vision[-1].belief, scene.part, scene.peg))

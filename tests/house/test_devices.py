@@ -32,6 +32,7 @@ from tests.house.stand_in_device import GPU, There, stand_in
 NEEDS_GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="torch reaches no GPU")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("profile", ["perfect", "ur5e"])
 def test_a_run_of_the_stand_in_has_the_processors_evidence(
     profile: str, monkeypatch: pytest.MonkeyPatch
@@ -122,6 +123,7 @@ def test_one_image_is_compared_at_the_rays_of_each_camera(monkeypatch: pytest.Mo
     torch.testing.assert_close(found[1] - found[0], host[1] - host[0], rtol=0.02, atol=0.0)
 
 
+@pytest.mark.long
 def test_the_command_runs_on_the_device_and_keeps_which(
     bcppl: Callable[..., Ran], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -135,6 +137,7 @@ def test_the_command_runs_on_the_device_and_keeps_which(
     assert record["device"] == "cuda" and record["complete"]
 
 
+@pytest.mark.long
 def test_a_run_goes_on_with_particles_that_were_kept_on_the_host(monkeypatch: pytest.MonkeyPatch) -> None:
     recording, program = load_recording("peg_probe"), model.with_settings(profile="perfect")
 

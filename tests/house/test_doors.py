@@ -45,11 +45,13 @@ def test_describing_a_recording_imports_no_simulator_and_no_tensor_library() -> 
     assert modules.isdisjoint({"torch", "pyro", "scipy", "trimesh", "matplotlib", "mujoco", "numba"})
 
 
+@pytest.mark.long
 def test_checking_a_recording_imports_what_renders_and_measures_gaps_and_no_physics() -> None:
     modules = imported("from bcppl.cli import app\napp(['check', 'peg_probe'], standalone_mode=False)")
     assert modules.isdisjoint({"mujoco", "matplotlib", "bcppl.inference"})
 
 
+@pytest.mark.long
 def test_a_package_can_be_sent_to_another_process_before_it_was_used() -> None:
     """As a function of a script is, which names what the script imported."""
     code = "import cloudpickle, pickle\nfrom bcppl.inference.filters import guided_smc\n"
@@ -58,6 +60,7 @@ def test_a_package_can_be_sent_to_another_process_before_it_was_used() -> None:
     assert "bcppl.models.worlds" in imported(code)
 
 
+@pytest.mark.long
 def test_no_export_imports_the_compiler_of_torch() -> None:
     code = "import bcppl\nfor name in bcppl.__all__: getattr(bcppl, name)\n"
     code += "for name in bcppl.inference.__all__: getattr(bcppl.inference, name)"
@@ -81,6 +84,7 @@ def in_any_order(seed: int) -> str:
     return "\n".join([*lines, *(f"dir({name})" for _, name in found)])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "code",
     [
@@ -95,10 +99,12 @@ def test_modules_are_imported_in_any_order(code: str) -> None:
     assert {"torch", "pyro"} <= imported(code)
 
 
+@pytest.mark.long
 def test_what_is_set_in_a_module_before_its_use_stays() -> None:
     imported("from bcppl import poses\nposes.compose = 3\nassert poses.compose == 3 and poses.inverse")
 
 
+@pytest.mark.long
 def test_a_submodule_is_imported_after_its_package() -> None:
     assert "bcppl.traces.model" in imported("from bcppl import traces; import bcppl.traces.faults")
 

@@ -15,6 +15,7 @@ import exact
 CELL = exact.Cell("Gaussian, D = 2, isotropic", "drift", 30, tuple(range(7)))
 
 
+@pytest.mark.long
 def test_a_file_adds_the_runs_that_a_cell_lacks(tmp_path: Path) -> None:
     torch.set_num_threads(1)
     file = tmp_path / "cells.jsonl"

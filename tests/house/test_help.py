@@ -47,6 +47,7 @@ def example(text: str) -> str:
     return textwrap.dedent("\n\n".join(block))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", PUBLIC)
 def test_help_opens_with_an_example_that_runs(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -39,6 +39,7 @@ def test_notebook_is_kept_as_it_was_executed(path: Path) -> None:
     assert path.stat().st_size < LARGEST
 
 
+@pytest.mark.long
 @shipped_or(
     {
         "recording": [NEAR],
@@ -64,6 +65,7 @@ def test_first_belief_runs_and_finds_the_part(kernel: Any, smaller: Smaller) -> 
     assert float(final) == adds["window 14"]
 
 
+@pytest.mark.long
 @shipped_or(
     {
         "infer": [("particles=300", "particles=80"), ("sweeps=5", "sweeps=3")],
@@ -91,6 +93,7 @@ def test_own_model_and_its_proposal_are_short() -> None:
     assert len((sources["model"] + "\n" + sources["proposal"]).splitlines()) < 60
 
 
+@pytest.mark.long
 @shipped_or(
     {
         "imports": [
@@ -127,6 +130,7 @@ def test_swap_kernels_puts_four_programs_side_by_side(kernel: Any, smaller: Smal
 FEW = '{"touch": 4, "slide": 1, "pair": 1}'
 
 
+@pytest.mark.long
 @shipped_or(
     {
         "look": [("particles=50", "particles=20")],
@@ -149,6 +153,7 @@ def test_where_to_touch_chooses_and_ends_in_the_hole(kernel: Any, smaller: Small
     assert "inserted: True" in printed["insert"]
 
 
+@pytest.mark.long
 @shipped_or({"imports": [("PARTICLES = 50", "PARTICLES = 20")]})
 def test_a_bench_that_is_not_perfect_is_seen_explained_and_the_peg_inserted(
     kernel: Any, smaller: Smaller
@@ -166,6 +171,7 @@ def test_a_bench_that_is_not_perfect_is_seen_explained_and_the_peg_inserted(
     assert "inserted: True" in printed["insert"]
 
 
+@pytest.mark.long
 @shipped_or(
     {
         "imports": [("SEED, T = 0, 60", "SEED, T = 0, 15")],
@@ -202,6 +208,7 @@ def test_series_agree_with_references_that_are_no_particle_filters(kernel: Any, 
     assert len(off) == 8 and max(map(abs, off)) < (1.5 if smaller else 0.4)
 
 
+@pytest.mark.long
 @shipped_or(
     {
         "invariance": [("count=20_000", "count=4000")],
@@ -225,6 +232,7 @@ def test_own_kernel_is_right_and_its_mutant_is_not(kernel: Any, smaller: Smaller
     assert len(re.findall(r"standard deviation [\d.]+$", printed["smc"], re.MULTILINE)) == 2
 
 
+@pytest.mark.long
 @shipped_or(
     {
         "train": [("steps=1000", "steps=60"), ("every=100", "every=30")],
@@ -256,6 +264,7 @@ def test_learned_proposal_learns_and_is_put_beside_the_prior(kernel: Any, smalle
     assert len(re.findall(r"([\d.]+) effective draws a second$", printed["worth"], re.MULTILINE)) == 4
 
 
+@pytest.mark.long
 @shipped_or(
     {
         "imports": [("PARTICLES = 75", "PARTICLES = 30")],
@@ -292,6 +301,7 @@ def test_real_contacts_bear_out_one_noise_and_friction_and_not_another(kernel: A
     assert 5 < float(half) < 25
 
 
+@pytest.mark.long
 @shipped_or(
     {
         "imports": [("PARTICLES = 50", "PARTICLES = 16")],
@@ -323,6 +333,7 @@ def test_own_bench_becomes_a_belief_and_its_mistakes_are_named(kernel: Any, smal
     assert smaller or float(squared) < 10.6
 
 
+@pytest.mark.long
 @shipped_or(
     {
         "imports": [("DRAWS, PARTICLES = 150, 50_000", "DRAWS, PARTICLES = 25, 20_000")],

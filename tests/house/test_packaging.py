@@ -55,6 +55,7 @@ def test_links_are_links() -> None:
         assert os.readlink(link) == f"../{name}"
 
 
+@pytest.mark.long
 def test_sdist_and_wheel_hold_every_file_of_the_package_as_a_real_file(built: tuple[Path, Path]) -> None:
     sdist, wheel = built
     with tarfile.open(sdist) as archive:
@@ -81,6 +82,7 @@ def installed(built: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory
     return target
 
 
+@pytest.mark.long
 def test_installed_wheel_finds_a_part_from_an_empty_folder(installed: Path, tmp_path: Path) -> None:
     where = quiet(
         [sys.executable, "-c", "import bcppl; print(bcppl.__file__)"], tmp_path, PYTHONPATH=str(installed)
@@ -97,6 +99,7 @@ def test_installed_wheel_finds_a_part_from_an_empty_folder(installed: Path, tmp_
     assert list(tmp_path.rglob("*.png")), "a run leaves pictures in the folder where it was started"
 
 
+@pytest.mark.long
 def test_no_module_is_imported_twice(tmp_path: Path) -> None:
     code = """
 import importlib, pkgutil, sys

@@ -179,6 +179,7 @@ def written(before: dict[str, Any], after: dict[str, Any]) -> list[str]:
     return [path for path in before | after if before.get(path) != after.get(path)]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", RUNS)
 def test_nothing_is_written_into_a_scene(name: str) -> None:
     _, before, after = listed_run(name)
@@ -206,6 +207,7 @@ def by_array(scene: Any) -> None:
     scene.likelihoods["window"].gap.part.vertices[0, 0] *= 1.0 + 1e-15
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("write", [by_entry, by_replaced_entry, by_attribute, by_tensor, by_array])
 def test_a_model_that_writes_into_its_scene_is_seen(write: Callable[[Any], None]) -> None:
     def program(scene: Any, actions: Sequence[Any]) -> None:
@@ -221,6 +223,7 @@ def test_a_model_that_writes_into_its_scene_is_seen(write: Callable[[Any], None]
     assert written(before, contents(scene)) != []
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", RESUMED)
 def test_a_resumed_run_is_the_uninterrupted_one(name: str) -> None:
     """It is resumed from nothing but a step."""
@@ -267,6 +270,7 @@ def alone(*which: int) -> list[Step]:
     return guided(bench(*which), fresh())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("one", "other"), [(TOP, LATER), (SECOND, TOP), (TOP, SECOND)])
 def test_two_branches_from_one_step_do_not_influence_each_other(one: int, other: int) -> None:
     """After a view: two windows, a view and a window, and a window and a view."""
@@ -282,12 +286,14 @@ def test_another_image_with_the_same_number_is_fitted() -> None:
     assert_same(alone(SECOND), guided(bench(SECOND), scene))
 
 
+@pytest.mark.long
 def test_a_run_in_another_order_on_the_same_scene_has_no_influence() -> None:
     scene = fresh()
     guided(bench(START, TOP, FIRST), scene)
     assert_same(alone(FIRST, START, TOP), guided(bench(FIRST, START, TOP), scene))
 
 
+@pytest.mark.long
 def test_a_run_by_another_inference_program_on_the_same_scene_has_no_influence() -> None:
     """Guided runs fit images, tempered ones do not."""
     scene, recording = fresh(), bench(FIRST, START, TOP)
@@ -296,6 +302,7 @@ def test_a_run_by_another_inference_program_on_the_same_scene_has_no_influence()
     assert_same(alone(FIRST, START, TOP), guided(recording, scene))
 
 
+@pytest.mark.long
 def test_a_guided_run_is_resumed_from_a_tempered_one_with_the_same_approximation() -> None:
     """It depends on the measurements alone, not on the particles."""
     model, scene = look_and_touch.model, fresh()

@@ -53,6 +53,7 @@ def assert_resumed_elsewhere(names: list[str], folder: Path) -> None:
             assert [a for a in one if not torch.equal(one[a], other[a])] == [], name
 
 
+@pytest.mark.long
 def test_in_another_process(tmp_path: Path) -> None:
     assert_resumed_elsewhere(["tempered, pushes", "drifting, a view and windows"], tmp_path)
 
@@ -90,6 +91,7 @@ def pressed(stamps: Sequence[int]) -> None:
         pyro.sample(f"seen_{number}", ContactsInTime(track, first, last, 0.001, every=3))
 
 
+@pytest.mark.long
 def test_a_fit_that_a_search_led_to_is_kept(tmp_path: Path) -> None:
     """Made again from the image alone, it would be the one that was refuted."""
     name = "guided, views and a touch"

@@ -79,6 +79,7 @@ VERBS: dict[str, Callable[[Population], Population]] = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", VERBS)
 def test_evidence_stays_unbiased(name: str) -> None:
     assert standard_errors(estimates(VERBS[name], 130)) < 4
@@ -177,6 +178,7 @@ def turned(pose: Tensor) -> Tensor:
     return turn.long() @ torch.tensor([1, 2, 4])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("candidates", [10, 1])
 def test_a_pose_by_strata_of_ones_own(candidates: int) -> None:
     def program(count: int) -> None:

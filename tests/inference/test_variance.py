@@ -81,6 +81,7 @@ def compared(
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["never", "always", "adaptive"])
 def test_one_run_says_how_much_many_runs_differ(name: str) -> None:
     runs = 300 if name == "always" else 150  # those of "always" serve the mutant below as well

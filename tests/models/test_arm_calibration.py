@@ -66,6 +66,7 @@ def test_recordings_scatter_as_their_publication_reports(name: str) -> None:
     assert np.mean([apart(calibrated, pair) for pair in pairs]) == pytest.approx(50.0, abs=0.1)
 
 
+@pytest.mark.long
 @needed
 @pytest.mark.parametrize("name", PLACES)
 def test_two_positions_calibrate_the_distance_at_the_others(name: str) -> None:

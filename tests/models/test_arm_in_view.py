@@ -81,6 +81,7 @@ def test_the_truth_is_the_likeliest_with_its_own_bias() -> None:
     assert float(likelihood[6]) > float(log_likelihood(scene, seen, TRUTH[None], 0.0))
 
 
+@pytest.mark.long
 def test_camera_and_bias_are_estimated_jointly() -> None:
     scene, seen = drawn(0.012, widening=0.0, effective_pixels=1000.0)
     torch.manual_seed(0)

@@ -60,6 +60,7 @@ def expectations(trace: Trace) -> Tensor:
     return torch.cat([x, (x[:, :, None] * x[:, None, :]).flatten(1), torch.cos(2.0 * x)], dim=1)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("proposal", camera_error.model.proposals)
 def test_proposals_leave_the_target_invariant(recording: Recording, proposal: Callable[..., None]) -> None:
     torch.manual_seed(2)
@@ -120,7 +121,8 @@ def test_several_views_share_one_error() -> None:
     torch.testing.assert_close(first.pose, second.pose, rtol=0.0, atol=0.0)
 
 
-@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [1, 2])
 def test_beliefs_hold_the_truth_and_are_as_wide_as_the_cameras_errors(seed: int) -> None:
     recording = simulate_recording(seed)
     *_, last = infer(camera_error.model, recording, seed=seed)

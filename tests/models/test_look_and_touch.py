@@ -44,6 +44,7 @@ def test_sigma_points_keep_the_covariance_of_a_fit_through_a_linear_map() -> Non
     assert torch.allclose(0.5 * away.T @ away, turn @ fit.covariance @ turn, rtol=1e-9)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", (11, 14, 30))
 def test_images_of_a_small_part_do_not_place_it_surer_than_they_can(seed: int) -> None:
     """The yaw of a tray is seen to a few degrees. Taken for the cameras' half degree, d^2 was over 100."""

@@ -59,6 +59,7 @@ def held(seen: Recording, **settings: float) -> tuple[bool, float, float]:
     return bool(region.contains(TRUTH)), float(off.norm()), float(squared)
 
 
+@pytest.mark.long
 def test_the_region_holds_a_truth_that_an_erring_image_misses_and_without_latent_errors_does_not() -> None:
     displaced = recording((0.003, -0.002, 0.008))
     holds, off, squared = held(displaced, **ERRORS)

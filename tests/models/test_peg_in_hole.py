@@ -123,6 +123,7 @@ def test_windows_of_one_probe_share_one_rollout_per_particle() -> None:
         assert torch.equal(pieces.log_prob(site), whole.log_prob(site)[[2, 0, 1]]), site
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("infer", [few_moves.infer, bayes_contact.infer])
 def test_same_seed_same_belief_to_the_bit(infer) -> None:  # type: ignore[no-untyped-def]
     short = dataclasses.replace(recorded(), measurements=recorded().measurements[:9])
@@ -137,6 +138,7 @@ def test_same_seed_same_belief_to_the_bit(infer) -> None:  # type: ignore[no-unt
     assert not torch.equal(first, last(6))
 
 
+@pytest.mark.long
 def test_geometry_guides_and_physics_finds_the_hole() -> None:
     """On the shipped recording, to a millimetre or two; a run that is resumed goes on to the same bits."""
     *_, last = guided_smc.infer(peg_in_hole.model, recorded(), particles=20, seed=1)
@@ -200,6 +202,7 @@ def test_contact_locations_alone_have_no_geometry() -> None:
     assert not isinstance(blind, Screens) and isinstance(scene().likelihoods["window"], Screens)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("evidence", [("contacts", "pose"), ("contacts", "wrench"), ("gaps", "wrench")])
 def test_geometry_guides_whatever_is_explained(evidence: tuple[str, ...]) -> None:
     """Where gaps are no evidence they only propose: their likelihood is not in the target."""

@@ -30,6 +30,7 @@ KERNELS: dict[str, Kernel] = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", KERNELS)
 def test_a_prior_across_the_cut_is_left_invariant(name: str) -> None:
     cosines = []

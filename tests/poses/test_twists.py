@@ -70,6 +70,7 @@ def covariance(turn: float) -> Tensor:
     return scale[:, None] * (0.3 * root @ root.T + torch.eye(6, dtype=torch.float64)) * scale
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("turn", [0.05, 0.4, 1.0])  # radians; of the last, turns beyond pi count
 def test_the_density_is_normalised_and_that_of_its_draws(turn: float) -> None:
     torch.manual_seed(0)

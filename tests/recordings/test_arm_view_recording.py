@@ -41,6 +41,7 @@ def test_at_the_reference_the_arm_is_where_the_image_is_nearer_than_its_backgrou
     assert float((np.abs(off) < 0.03).mean()) > 0.7
 
 
+@pytest.mark.long
 def test_an_image_may_be_taken_to_see_the_part_where_it_is() -> None:
     recording = load_recording("arm_view")
     model = part_in_view.model.with_settings(shift=0.0)

@@ -59,6 +59,7 @@ def _fine(outcome: str) -> bool:
     return outcome in ("equal", "refused", "edited")
 
 
+@pytest.mark.long
 def test_damaged_files_are_read_as_they_were_or_refused(tmp_path: Path) -> None:
     campaign(tmp_path, 115, 0)
 
@@ -135,6 +136,7 @@ def test_a_recording_of_an_earlier_version_is_read_to_the_bit(tmp_path: Path) ->
     assert_identical(load(path), full())
 
 
+@pytest.mark.long
 def test_numbers_that_compress_too_well_are_written_as_they_are(tmp_path: Path) -> None:
     """Compressed, 80 MB of one depth would lie in 100 kB, which is refused as a bomb."""
     wide = dataclasses.replace(camera("wide"), width=5000, height=4200)
@@ -314,6 +316,7 @@ for size in (0, 50):
 """
 
 
+@pytest.mark.long
 def test_a_full_disk_is_a_sentence_and_leaves_what_was_there(tmp_path: Path) -> None:
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     done = subprocess.run(

@@ -47,6 +47,7 @@ def right(seed: int, real: bool) -> Recording:
     return plausibility.recorded(bench_scene(seed, BenchParameters.real() if real else None))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", TESTED)
 def test_a_mistake_is_named_once_and_with_its_cause(name: str) -> None:
     # Scene 3 is one of which an inverted camera still sees what looks like its part.
@@ -59,6 +60,7 @@ def test_a_mistake_is_named_once_and_with_its_cause(name: str) -> None:
     assert_one_sentence(found)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("millimetres", [80, 120])
 def test_how_far_along_its_axis_a_peg_is_off_is_named_where_its_sides_touch(millimetres: int) -> None:
     """A peg of 80 mm whose sides touch is as near anywhere along them."""
@@ -66,11 +68,13 @@ def test_how_far_along_its_axis_a_peg_is_off_is_named_where_its_sides_touch(mill
     assert f"the peg is {millimetres} mm farther along its axis" in found
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", RIGHT)
 def test_a_right_recording_gives_no_doubt(name: str) -> None:
     assert doubts(plausibility.RIGHT[name](right(11, True))) == []  # a tray, whose images fit least
 
 
+@pytest.mark.long
 def test_a_right_recording_of_a_bench_without_errors_gives_no_doubt() -> None:
     assert doubts(right(11, False)) == []
 
@@ -84,6 +88,7 @@ def test_a_recording_of_a_few_pixels_is_not_judged() -> None:
     assert doubts(full()) == []
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "name", [name for name, mistake in plausibility.MISTAKES.items() if not mistake.words]
 )
@@ -132,6 +137,7 @@ def test_several_mistakes_are_named_one_by_one() -> None:
     assert all(any(NAMEABLE[name].words in line for line in found) for name in names)
 
 
+@pytest.mark.long
 def test_the_same_of_several_views_is_one_line() -> None:
     recording = right(3, False)
     views = [m for m in recording.measurements if m.kind == "view"]
@@ -189,6 +195,7 @@ def test_a_check_that_compares_nothing_is_seen(monkeypatch: pytest.MonkeyPatch) 
                 test_a_mistake_is_named_once_and_with_its_cause(name)
 
 
+@pytest.mark.long
 def test_the_command_line_prints_and_keeps_doubts(tmp_path: Path) -> None:
     wrong = plausibility.windows_left_out(right(3, False))
     save(NAMEABLE["focal length doubled"].made(wrong), tmp_path / "wrong.h5")
@@ -197,6 +204,7 @@ def test_the_command_line_prints_and_keeps_doubts(tmp_path: Path) -> None:
     assert "doubt: the views show" in " ".join(checked.output.split()) and "but 1 doubt." in checked.output
 
 
+@pytest.mark.long
 def test_a_run_prints_doubts_and_keeps_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     recording = load_recording("point_probe_10_pushes")
     save(replace(recording, measurements=recording.measurements[:1]), tmp_path / "one.h5")

@@ -99,6 +99,7 @@ def test_a_step_of_the_command_is_refused_and_ends_the_reading(stand_in: Any) ->
         control.writeOnce(stand_in.CartesianPose(matrix))
 
 
+@pytest.mark.long
 def test_a_view_and_a_guarded_descent_through_the_simulated_arm(stand_in: Any) -> None:
     program, module = (importlib.import_module(each) for each in ("touch_and_insert", "franka.arm"))
     module.SILENT = 60.0  # s: the machine of a test may be busy

@@ -36,6 +36,7 @@ class DirectArm:
         return [self._reading(self._stamp, wrench, self._stamp, pose)]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("away", [0.0, 0.3])
 def test_a_peg_is_inserted_and_not_pushed_where_there_is_no_part(
     away: float, capsys: pytest.CaptureFixture[str]

@@ -87,6 +87,7 @@ def _written(signature: inspect.Signature) -> str:
     return " ".join(words)
 
 
+@pytest.mark.long
 def test_views_and_a_guarded_descent_by_topics(ros: Any) -> None:
     node_of, stand_in, program = (
         importlib.import_module(name) for name in ("ros2.node", "ros2.stand_in", "touch_and_insert")

@@ -41,6 +41,7 @@ def connected(programs: dict[str, Any], tmp_path: Path) -> Iterator[Any]:
             stand_in.kill()
 
 
+@pytest.mark.long
 def test_a_guarded_descent_through_ur_rtde_stops_on_the_part(
     programs: dict[str, Any], connected: Any
 ) -> None:

@@ -111,6 +111,7 @@ def log_likelihood(recording: Recording, pose: Tensor, forget: bool = False) -> 
     return total
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("rate", [20, 50, 100, 500])
 def test_the_likelihood_does_not_depend_on_how_a_probe_is_cut(rate: int) -> None:
     pose = around(20, 0, 5e-5, 1e-3)
@@ -219,6 +220,7 @@ def test_rows_do_not_depend_on_later_stamps_and_those_of_a_mutant_do() -> None:
 # ---------------------------------------------------------------- deferred and repeated measurements
 
 
+@pytest.mark.long
 def test_fine_windows_give_the_belief_of_coarse_ones_to_the_bit_and_steps_for_all() -> None:
     coarse, fine = (
         list(infer(look_and_touch.model, cut(probed(50), length), particles=6, seed=1)) for length in (25, 1)
@@ -232,6 +234,7 @@ def test_fine_windows_give_the_belief_of_coarse_ones_to_the_bit_and_steps_for_al
     assert torch.equal(last.belief.world_from_part, fine[-1].belief.world_from_part)
 
 
+@pytest.mark.long
 def test_a_window_given_twice_counts_once_and_is_named() -> None:
     once = cut(probed(100), 50)
     twice = replace(once, measurements=[*once.measurements[:3], *once.measurements[2:]])

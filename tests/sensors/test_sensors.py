@@ -259,6 +259,7 @@ def block_and_beams(laser: Any) -> tuple[Recording, torch.Tensor]:
     return Recording(part, guess, measurements, truth=truth.numpy(), model="look_and_touch"), truth
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "infer",
     [guided_smc.infer, partial(tempered_smc.infer, sweeps=4, share=0.6)],
@@ -288,6 +289,7 @@ def test_the_quadratic_approximation_of_a_new_kind_agrees_with_differences(laser
         assert bool((torch.linalg.eigvalsh(quadratic.information) > -1e-3).all())
 
 
+@pytest.mark.long
 def test_a_new_kind_is_ranked_and_laid_out_beside_others(laser: Any) -> None:
     recording, _ = block_and_beams(laser)
     *_, last = guided_smc.infer(look_and_touch.model, recording, particles=40, seed=1)

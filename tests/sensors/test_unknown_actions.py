@@ -83,6 +83,7 @@ def test_a_program_names_an_action_that_it_does_not_know(name: str, kind: str, h
             simulate(program, (scene(name, held), [*before, OTHERS[kind]()]), PARTICLES)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", OTHERS)
 def test_an_approximation_and_its_kernels_name_an_action_that_they_do_not_know(kind: str) -> None:
     """After a view, an action of another kind is treated as neither a view nor a window."""

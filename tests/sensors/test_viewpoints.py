@@ -38,6 +38,7 @@ def off(generator: np.random.Generator, size: float = 1.0) -> Tensor:
     return torch.from_numpy(size * generator.normal(size=6) * ([SHIFT] * 3 + [TURN] * 3))
 
 
+@pytest.mark.long
 def test_errors_have_the_covariance_of_one_mounting_and_each_place() -> None:
     """By errors drawn as they arise: one of the camera on the wrist, one of the wrist at each place."""
     cameras, part, generator = (
@@ -127,6 +128,7 @@ def on_a_wrist(seed: int, views: int) -> Recording:
     return Recording(part=PART, guess=GUESS, measurements=measurements, truth=truth.numpy())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("views", [2, 3])
 def test_several_views_of_a_wrist_camera_hold_the_truth(views: int) -> None:
     """With one error for all viewpoints, none approximated but the first, x was 3 to 14 deviations off."""

@@ -208,6 +208,7 @@ def test_particles_are_as_in_a_larger_population_however_many_entries_a_plate_ha
         torch.testing.assert_close(leaves[1].grad, leaves[0].grad[index])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("particles", [3, 5, 8])
 def test_kernels_move_as_many_particles_as_a_plate_has_entries(particles: int) -> None:
     """A conjugate hierarchy: groups of chains as many as entries, or fewer, have its posterior means."""

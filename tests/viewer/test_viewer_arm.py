@@ -88,6 +88,7 @@ def test_an_arm_without_meshes_is_drawn_as_segments(
     assert links[0].name == "panda_link0" and links[0].vertices[:, 2].max() == pytest.approx(joint[2])
 
 
+@pytest.mark.long
 def test_an_arm_that_reaches_no_touch_is_refused(arm: ArmWithPeg, touched: Recording) -> None:
     with pytest.raises(InputError, match="panda reaches no touch"):
         view(touched, arm=arm._replace(world_from_base=FAR))
@@ -109,6 +110,7 @@ def test_the_arm_is_seen_in_step_with_the_touch(arm: ArmWithPeg, tmp_path: Path)
     assert coloured(unseen, METAL, SPACE) < 1000
 
 
+@pytest.mark.long
 def test_the_command_line_draws_the_arm_or_refuses_in_one_sentence(bcppl: Callable[..., Ran]) -> None:
     hand = ["--robot", "panda", "--link", "panda_hand", "--link-from-peg", "0 0 0.1 0 1 0 0"]
     ran = bcppl("view", "peg_probe", "--save", "arm.html", *hand)

@@ -247,6 +247,7 @@ def pressed_with_the_peg_off(shift: float) -> Recording:
     return replace(recording, measurements=[Measurement(whole.action, touch)])
 
 
+@pytest.mark.long
 def test_the_pose_relative_to_the_peg_is_sure_where_that_in_the_world_is_not() -> None:
     """Along z, where peg and part are off alike: what the touches fix is the one relative to the other."""
     shift = 0.0008
@@ -309,6 +310,7 @@ def changes_of(fault: str, seed: int = 21004) -> list[SuddenChange]:
     return sudden_changes(population)
 
 
+@pytest.mark.long
 def test_a_part_that_slid_is_named_with_its_time_and_one_that_stood_is_not() -> None:
     (change,) = changes_of("slide")
     assert change.name == "the part slid" and change.probability > 0.9
@@ -325,6 +327,7 @@ def test_a_perfect_bench_has_none_and_an_unknown_profile_is_refused() -> None:
         look_and_touch.prepare(probed(100), profile="ur5")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("seed", "fault"), [(21000, "delay"), (21001, "delay"), (21004, "delay"), (21004, "none")]
 )

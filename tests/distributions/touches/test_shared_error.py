@@ -118,6 +118,7 @@ def test_a_touch_that_is_impossible_tells_nothing_of_the_scatter() -> None:
     assert torch.isfinite(after).all() and torch.allclose(after, alone, atol=0.5)
 
 
+@pytest.mark.long
 def test_two_touches_that_scatter_widen_the_third() -> None:
     torch.manual_seed(0)
     pose, spreads = at(0.0).expand(20000, 7), []

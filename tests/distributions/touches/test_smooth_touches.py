@@ -40,6 +40,7 @@ def path(start: Tensor, seed: int, shift: float, turn: float) -> Tensor:
     return poses.retract(start.expand(STEPS, 7), way)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("shape", ["hexagon 12 mm", "D 10 mm", "round tray"])
 @pytest.mark.parametrize("seed", range(6))
 def test_a_gap_changes_no_faster_than_the_peg_moves(shape: str, seed: int) -> None:
@@ -144,6 +145,7 @@ def test_a_square_peg_that_is_turned_in_the_hand_touches_with_another_corner() -
     assert float(about_none.log_evidence[0]) < exact - 3.0, "linear about no turn"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(4))
 def test_no_micrometre_is_worth_a_nat(seed: int) -> None:
     """Of a peg whose turn in the hand is not known, flat on a face: the corner that touches changes."""

@@ -46,6 +46,7 @@ def test_a_slip_is_one_of_the_sums_over_when_it_was() -> None:
     assert float((expected - each[0]).min()) > 3.0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", ["slips and slides at once", "slides in a touch that is an outlier"])
 def test_evidence_sums_over_all_that_may_have_happened_at_each_touch(case: str) -> None:
     """Nothing, a slip, a slide or both, in a touch that is an outlier or not, enumerated."""

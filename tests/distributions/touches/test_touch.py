@@ -96,6 +96,7 @@ def test_onset_masses_sum_to_one(start: tuple[float, ...], end: tuple[float, ...
         assert float(mass[:steps].mean() * path.length + mass[steps:].sum()) == pytest.approx(1.0, abs=4e-3)
 
 
+@pytest.mark.long
 def test_onset_masses_sum_to_one_where_the_finger_touches_twice() -> None:
     distance = Boxes((0.05, 0.1, 0.15), (0.0, 0.0, 0.0), (0.0, 0.22, 0.0))
     path, steps = straight((-0.0497, 0.08, 0.0), (-0.0497, 0.14, 0.0), 401), 4000

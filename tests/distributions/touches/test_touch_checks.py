@@ -96,6 +96,7 @@ def _moved(measurement: Measurement, by: float) -> Measurement:
     return replace(measurement, action=replace(measurement.action, world_from_tip=tip))
 
 
+@pytest.mark.long
 def test_a_part_that_moves_between_touches_is_named_and_one_that_stays_is_not() -> None:
     warned = 0
     for seed in range(10):

@@ -75,6 +75,7 @@ def correlated() -> None:
     pyro.sample("y", dist.Normal(x.cumsum(-1), 0.2).to_event(1))
 
 
+@pytest.mark.long
 def test_persistent_particles_are_weighted_for_a_gaussian_posterior() -> None:
     y = matrix([0.5, -0.3, 1.0, 0.7])
     sums = torch.tril(torch.ones(4, 4, dtype=torch.float64))
@@ -120,6 +121,7 @@ def exchanged(seed: int, moves: int = 50, chains: int = 40) -> replicas.Replicas
     return replica_exchange(kernel, start, moves, LADDER, warm_up=20, progress=False)
 
 
+@pytest.mark.long
 def test_replicas_have_both_modes_by_their_probability() -> None:
     run = exchanged(0)
     x = run.chains.draws["x"]

@@ -49,6 +49,7 @@ def runs(count: int, proposal: Any = near, **options: Any) -> tuple[Tensor, Tens
     return torch.tensor(errors), torch.stack(means)
 
 
+@pytest.mark.long
 def test_evidence_and_mean_are_exact() -> None:
     torch.manual_seed(0)
     errors, means = runs(8)
@@ -79,6 +80,7 @@ def test_the_posterior_as_the_proposal_needs_no_bridge() -> None:
     assert population.log_evidence == pytest.approx(LOG_EVIDENCE, abs=1e-10)
 
 
+@pytest.mark.long
 def test_addresses_that_the_proposal_leaves_out_come_from_the_program() -> None:
     def two() -> None:
         x = pyro.sample("x", dist.Normal(number(0.0), 1.0))
@@ -136,6 +138,7 @@ def near_density(trace: Trace) -> Tensor:
     return dist.Normal(CENTER + 0.2, 0.3).to_event(1).log_prob(trace["x"])
 
 
+@pytest.mark.long
 def test_mutant_with_another_density_of_the_proposal(monkeypatch: pytest.MonkeyPatch) -> None:
     """The square of the proposal's density has the integral (2 sqrt(pi) 0.6)^-4."""
 

@@ -208,6 +208,7 @@ def runs(name: str) -> tuple[np.ndarray, list[Population]]:
     return {**CASES, **LONGER}[name][0].run()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", [*CASES, *(pytest.param(name, marks=LONG) for name in LONGER)])
 def test_evidence(name: str) -> None:
     errors, _ = runs(name)
@@ -259,12 +260,14 @@ def test_hidden_markov_model_whatever_the_resampling(resample: Any) -> None:
     agrees(errors, 0.02)
 
 
+@pytest.mark.long
 def test_waste_free_on_the_points() -> None:
     moves = waste_free_moves(metropolis_hastings(drift("pose", (0.3, 1.0))), 150)
     errors, _ = POINTS_5.run(tempered(rejuvenation=moves, share=0.6))
     agrees(errors, 0.05)
 
 
+@pytest.mark.long
 def test_sites_tempered_one_after_another() -> None:
     """Two measurements of different cost at once: the cheap one first, each with exponents of its own."""
 

@@ -189,6 +189,7 @@ def test_in_several_processes_it_gives_the_same() -> None:
     assert np.array_equal(one.ranks, two.ranks) and np.allclose(one.posterior, two.posterior, rtol=1e-12)
 
 
+@pytest.mark.long
 def test_functions_of_a_notebook_run_in_other_processes_and_open_files_do_not(tmp_path: Path) -> None:
     inference = partial(normal_inference, exact)
     one, two = (calibrate(NORMAL, lambda data: inference(data), 2, jobs=k) for k in (1, 2))

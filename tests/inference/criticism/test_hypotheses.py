@@ -143,6 +143,7 @@ def test_a_mirrored_part_and_a_turned_one_are_named_and_the_right_one_is_not(
     assert "turned by -90° about its z" in likeliest(turned) and turned[0].gain > 20.0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("away", [(0.0, 0.0), (0.02, 0.0), (0.0, -0.015)])
 def test_an_image_of_a_part_that_moved_along_its_table_is_named_and_one_of_a_part_that_stood_is_not(
     away: tuple[float, float],

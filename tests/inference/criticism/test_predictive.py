@@ -69,6 +69,7 @@ def of_view(scene: BenchScene) -> Tensor:
     return torch.from_numpy(seen.depth)
 
 
+@pytest.mark.long
 def test_draws_of_the_model_are_seldom_surprising_and_a_wrong_noise_is() -> None:
     """Images drawn at other draws of the belief: p values spread over the whole of 0 to 1."""
     _, program = looked_at(temperature=1.0)

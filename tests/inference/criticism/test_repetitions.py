@@ -165,6 +165,7 @@ def run(seed):
 """
 
 
+@pytest.mark.long
 def test_processes_change_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a_program_of_its_own.py").write_text(PROGRAM)
     monkeypatch.syspath_prepend(str(tmp_path))
@@ -178,6 +179,7 @@ def test_processes_change_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert float(mean(one.pooled, "x")) == float(mean(two.pooled, "x"))
 
 
+@pytest.mark.long
 def test_a_process_that_ends_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a_program_that_ends.py").write_text(
         PROGRAM + "\n\ndef ends(seed):\n    import multiprocessing, os\n"

@@ -118,6 +118,7 @@ FAULTS: dict[str, tuple[Recording, Callable[[Recording], Recording], str]] = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", FAULTS)
 def test_evidence_is_for_what_was_wrong_and_for_nothing_else(name: str) -> None:
     """What would mend one recording makes a good one worse."""

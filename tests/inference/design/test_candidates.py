@@ -61,6 +61,7 @@ def planned(seed: int) -> tuple[BenchScene, PegGap, Candidates]:
     return scene, gap, found
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [5, 7])  # blocks with a square and a D-shaped hole
 def test_candidates_touch_the_faces_in_their_names_and_nothing_on_their_way(seed: int) -> None:
     scene, gap, found = planned(seed)
@@ -169,6 +170,7 @@ def test_constraints_count_the_candidates_that_violate_them() -> None:
     assert str(found) == "1 candidate; excluded those that press with more than 10 N (1), come from aside (3)"
 
 
+@pytest.mark.long
 def test_candidates_out_of_an_arms_reach_are_excluded() -> None:
     arm = load_robot("panda", tip="panda_hand_tcp")
     held = np.array([0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0])  # the hand's z axis points down, the peg's up

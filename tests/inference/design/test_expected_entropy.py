@@ -276,6 +276,7 @@ def after(prior: Tensor, table: Tensor) -> list[tuple[float, Tensor]]:
     return [(float(column.sum()), column / column.sum()) for column in joint.T]
 
 
+@pytest.mark.long
 def test_two_steps_ahead_are_the_exact_sum_and_right_where_greedy_is_wrong() -> None:
     torch.manual_seed(6)
     prior, tables = torch.softmax(0.3 * torch.randn(16, dtype=torch.float64), 0), bits_tables()

@@ -108,6 +108,7 @@ def test_a_plan_follows_the_axis_and_its_search_covers_the_belief_with_the_clear
     assert 1.5 < wide.search.manners.count("searching") / plan.search.manners.count("searching") < 2.1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("part", ["rectangular tray", "square 8 mm", "hexagon 12 mm"])
 def test_a_peg_with_a_tenth_of_clearance_goes_in_as_predicted(part: str) -> None:
     scene, plan = tight(part), plan_of(part)
@@ -133,6 +134,7 @@ def test_the_search_finds_the_hole() -> None:
     assert result.sustained_force < 30.0
 
 
+@pytest.mark.long
 def test_the_success_probability_is_the_arms_and_rises_with_clearance_and_precision() -> None:
     chances = []
     for clearance, shift in ((0.0001, 0.0004), (0.001, 0.001), (0.001, 0.0002)):
@@ -232,6 +234,7 @@ def _belief(world_from_part: torch.Tensor) -> Belief:
 FLAT = (0.5, 0.0, 0.15, 1.0, 0.0, 0.0, 0.0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("clearance", [1e-5, 1e-4, 1e-3])
 @pytest.mark.parametrize("spread", [(1e-3, 5e-5), (1e-3, 1e-3), (3e-4, 1e-4), (0.0, 0.0)])
 def test_a_search_keeps_its_speed_its_turns_and_its_time(

@@ -54,6 +54,7 @@ def followed() -> list[Round]:
     return list(probing_loop(model, look, BenchArm(scene), asked, rank, start=last, probes=2))
 
 
+@pytest.mark.long
 def test_chosen_probes_lower_the_error_to_a_fraction_and_the_peg_goes_in() -> None:
     scene, _, last, _ = seen()
     points = scene.part.surface_points()
@@ -81,6 +82,7 @@ def test_rounds_execute_the_best_candidate_and_the_recording_grows() -> None:
     assert not problems(followed()[-1].recording)
 
 
+@pytest.mark.long
 def test_the_loops_belief_is_that_of_a_run_over_all_it_measured() -> None:
     first, second = followed()
     *_, whole = infer(model, first.recording, particles=PARTICLES, seed=0)
@@ -89,6 +91,7 @@ def test_the_loops_belief_is_that_of_a_run_over_all_it_measured() -> None:
     assert second.before is first.step
 
 
+@pytest.mark.long
 def test_the_loop_ends_by_gain_by_success_probability_and_by_number() -> None:
     scene, look, last, _ = seen()
 
@@ -178,6 +181,7 @@ def test_measurements_must_be_of_the_chosen_candidate_and_fit_the_recording() ->
             BenchArm(scene).execute(what)  # type: ignore[arg-type]
 
 
+@pytest.mark.long
 def test_probes_together_last_no_longer_than_they_may_and_as_long_as_that() -> None:
     scene, look, last, _ = seen()
     plans = asked(last.belief, 0)

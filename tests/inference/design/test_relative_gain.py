@@ -82,6 +82,7 @@ def heights(count: int) -> None:
         pyro.sample(f"height_{k}", Height(part))
 
 
+@pytest.mark.long
 def test_a_touch_informs_the_relative_pose_and_hardly_that_in_the_world() -> None:
     """Part and grasp are each 1 mm unsure along z: a sharp touch leaves 1/sqrt(2) mm in the world."""
     torch.manual_seed(0)
@@ -132,6 +133,7 @@ def test_modes_that_the_grasp_can_explain_are_not_told_apart(apart: float) -> No
     assert gain.information_gain == pytest.approx(which + within, abs=0.02)
 
 
+@pytest.mark.long
 def test_the_gaussian_is_that_of_the_belief_s_own_draws() -> None:
     """After presses along z, which make part and grasp depend on one another."""
     rows = MIXED[MIXED[:, FELT] == 1.0].clone()

@@ -214,6 +214,7 @@ def gaps(seed: int) -> tuple[np.ndarray, np.ndarray]:
     return gaps[0].distance[0].numpy(), gaps[1].distance[0].numpy()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", SEEDS)
 def test_no_free_motion_touches_the_part_and_every_guarded_one_does(seed: int) -> None:
     _, plan, motion = carried(seed)
@@ -266,6 +267,7 @@ def test_strokes_are_as_long_as_the_belief_is_unsure() -> None:
     assert shortest < lengths[1][1] < longest
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_rocked_peg_leans_and_turns_both_ways_about_its_tip_and_stays_in_contact(seed: int) -> None:
     scene = bench_scene(seed)

@@ -281,22 +281,26 @@ def test_the_same_seed_gives_the_same_belief_to_the_bit() -> None:
     assert one.info.log_evidence == other.info.log_evidence
 
 
+@pytest.mark.long
 def test_the_backward_kernel_leads_back_to_where_the_forward_kernel_came_from() -> None:
     """Two cameras, then touches."""
     steps = run_checked(look_and_touch.model, some(VIEW, 1, *TOUCH), particles=6)
     assert len(steps) == 10 and all(math.isfinite(s.info.log_evidence) for s in steps)
 
 
+@pytest.mark.long
 def test_a_second_camera_after_a_touch_is_assimilated() -> None:
     *_, last = infer(look_and_touch.model, some(VIEW, *TOUCH, 1), particles=6, seed=0)
     assert last.taken == 9
 
 
+@pytest.mark.long
 def test_a_first_camera_after_touches_is_assimilated() -> None:
     *_, last = infer(look_and_touch.model, some(*TOUCH, VIEW), particles=6, seed=0)
     assert last.taken == 8 and math.isfinite(last.info.log_evidence)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [0, 2, 3])
 def test_touches_alone_place_the_part(seed: int) -> None:
     """The top, one side and the next, no image."""

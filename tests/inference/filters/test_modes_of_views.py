@@ -124,6 +124,7 @@ def seen(seed: int, particles: int = 75) -> Step:
     return last
 
 
+@pytest.mark.long
 def test_the_fit_of_each_image_has_both_ends() -> None:
     approximation = seen(0).population.approximation
     assert [len(each.fit.means) for each in approximation.fits.values()] == [2, 2]
@@ -261,6 +262,7 @@ def test_a_population_that_misses_the_mode_is_replaced_by_evidence() -> None:
     assert 0 < int((joined["x"] == -3.0).sum()) < 50, "an estimate of 1 beside one of 0.24 keeps its share"
 
 
+@pytest.mark.long
 def test_the_record_of_a_step_has_the_ancestors_after_a_second_search(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

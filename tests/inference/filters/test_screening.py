@@ -121,6 +121,7 @@ def assimilated(particles: int, by: Callable[..., Population]) -> Population:
     return population
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("by", [in_place, moved])
 def test_evidence_and_mean_are_those_of_the_physics_whatever_the_cheap_likelihood_is(
     by: Callable[..., Population],

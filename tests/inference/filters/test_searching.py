@@ -84,6 +84,7 @@ def exact_log_evidence() -> float:
     return float(torch.logsumexp(density, 0)) - math.log(len(x))
 
 
+@pytest.mark.long
 def test_a_mode_that_all_particles_left_is_reached_again() -> None:
     for seed in (0, 5):
         step = last(seed)
@@ -169,6 +170,7 @@ def ends_at_the_truth(seed: int) -> None:
     assert off(steps[-1], hard.truth) < 5.0 and undetermined(steps[-1].population, "part") is None
 
 
+@pytest.mark.long
 def test_the_hard_draw_ends_at_the_truth() -> None:
     ends_at_the_truth(0)
 

@@ -106,6 +106,7 @@ def kept_weights(population: Population) -> tuple[Population, Tensor | None]:
 SCHEMES = {"never": never, "always": always(), "adaptive": adaptive(systematic, 0.7)}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_evidence_is_unbiased_with_fixed_exponents(scheme: str) -> None:
     values = [number(y) for y in OBSERVED]
@@ -127,6 +128,7 @@ def test_mutant_that_keeps_weights_when_resampling(monkeypatch: pytest.MonkeyPat
     assert standard_errors(ratios(static, values, static_evidence(), take, 60, 200)) > 8
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_hidden_markov_model(scheme: str) -> None:
     take = tempered(None, resample=SCHEMES[scheme], share=0.0)
@@ -140,6 +142,7 @@ def test_hidden_markov_model(scheme: str) -> None:
 # ---- BayesContact's own filter
 
 
+@pytest.mark.long
 def test_the_baseline_weighs_by_all_measurements(monkeypatch: pytest.MonkeyPatch) -> None:
     values = [number(y) for y in OBSERVED]
     for fit, resample in ((fixed_drift, always()), (drift("x", (0.2, 0.21)), adaptive())):

@@ -205,6 +205,7 @@ MUTANTS = [
 ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("case", "name", "mutant"), MUTANTS)
 def test_mutants_that_forget_a_volume_or_the_way_back(
     case: str, name: str, mutant: Any, monkeypatch: pytest.MonkeyPatch

@@ -181,6 +181,7 @@ def test_evidence_is_unbiased(name: str) -> None:
     assert 0.01 < found.std() < 0.8
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "mutant"), [("log_abs_det_jacobian", flat), ("assessed", silent)])
 @pytest.mark.parametrize("case", ["pulled to what is seen", "auxiliary guess"])
 def test_mutants_have_the_wrong_evidence(

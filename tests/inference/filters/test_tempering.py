@@ -84,6 +84,7 @@ def test_nothing_left_is_an_error_that_says_what_to_try(share: float, resample: 
     assert str(caught.value).count("\n") == 0
 
 
+@pytest.mark.long
 def test_sites_that_the_program_fixes_are_tempered_like_observations() -> None:
     """What `obs=` fixes is tempered too: left out after the first step, it would cost 0.4 of log Z."""
     exact = -0.5 * math.log(1.0 + 1.0 / 0.01 + 1.0 / 0.01) - math.log(2 * math.pi * 0.01)

@@ -240,6 +240,7 @@ def test_the_contact_may_be_elsewhere_where_the_part_is_not_known_to_half_a_mill
         assert GaussianApproximation("part", Scene(prior, {}, "toy"))._is_unsure() is unsure
 
 
+@pytest.mark.long
 def test_the_belief_holds_both_alike() -> None:
     held = []
     for seed in range(6):

@@ -52,6 +52,7 @@ def believed(scene: BenchScene, recording: Recording, off: float) -> Population:
     return Population(trace.at(there))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("off", [0.0, 0.05])
 def test_a_view_is_refuted_where_the_part_is_not(off: float) -> None:
     scene = bench_scene(50000)

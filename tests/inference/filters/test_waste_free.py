@@ -73,6 +73,7 @@ def biased(found: list[float]) -> float:
     return float(abs(np.mean(found) - 1) / (np.std(found, ddof=1) / math.sqrt(len(found))))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("chains", [10, 30])
 def test_evidence_is_unbiased_and_the_mean_is_right(chains: int) -> None:
     found, error = runs(metropolis_hastings(fixed_drift), chains)
@@ -80,6 +81,7 @@ def test_evidence_is_unbiased_and_the_mean_is_right(chains: int) -> None:
     assert error < 4
 
 
+@pytest.mark.long
 def test_mutant_without_the_way_back() -> None:
     _, error = runs(drift_without_way_back, 10)
     assert error > 8

@@ -106,12 +106,14 @@ DEPTH_CASES: dict[str, tuple[Callable[[], None], int]] = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", DEPTH_CASES)
 def test_depth_alignment_leaves_pose_and_image_invariant(case: str) -> None:
     program, steps = DEPTH_CASES[case]
     assert worst_z(program, depth_alignment("part", steps=steps), of_both, times=3 - steps) < SOUND
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", ["robust", "finger"])
 def test_mutant_recentred_on_the_data_without_its_way_back(
     case: str, monkeypatch: pytest.MonkeyPatch
@@ -242,6 +244,7 @@ CONTACT_CASES: dict[str, Callable[[], None]] = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", CONTACT_CASES)
 def test_contact_alignment_leaves_pose_and_touch_invariant(case: str) -> None:
     assert worst_z(CONTACT_CASES[case], contact_alignment("part"), of_touch) < SOUND

@@ -319,6 +319,7 @@ def particle_by_particle(population: Population, kernel: Kernel) -> Population:
     return Population(trace)
 
 
+@pytest.mark.long
 def test_stopping_together_leaves_no_bias_that_shows_and_each_alone_does() -> None:
     """75 exact draws, moved until they have come half a variance: over 40 runs the mean stays."""
     torch.manual_seed(6)

@@ -138,6 +138,7 @@ def by_chains(population: Population, kernel: Kernel) -> Tensor:
     return markov_chains(kernel, population, 3, progress=False).trace["x"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("mutated", [False, True])
 @pytest.mark.parametrize("by", [by_sweeps, by_chains])
 def test_moves_leave_exact_draws_with_copies_as_they_are(
@@ -204,6 +205,7 @@ def coins() -> None:
     pyro.sample("coin", dist.Categorical(torch.tensor([0.3, 0.7], dtype=torch.float64)))
 
 
+@pytest.mark.long
 def test_equal_discrete_values_are_no_copies() -> None:
     """A proposal fitted to the other half leaves the coin's probability as it is; halves by value do not."""
 

@@ -224,6 +224,7 @@ def still_on_its_line(kernel: Kernel, seed: int) -> float:
     return float((torch.cosine_similarity(start["x"], moved["x"], dim=1).abs() > 0.8).double().mean())
 
 
+@pytest.mark.long
 def test_few_particles_stay_on_their_line_through_the_mean() -> None:
     """After half a period a particle is at its mirror image; some trajectories have to be shorter."""
     default, half = (sum(still_on_its_line(k, s) for s in range(5)) for k in (hmc("x"), hmc("x", steps=8)))

@@ -115,6 +115,7 @@ RIGHT: dict[str, Kernel] = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", RIGHT)
 def test_a_right_kernel_passes(name: str) -> None:
     state = torch.get_rng_state()

@@ -41,6 +41,7 @@ KERNELS: dict[str, Kernel] = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("particles", [1, 20])
 @pytest.mark.parametrize("name", KERNELS)
 def test_chains_from_one_point_reach_the_posterior(name: str, particles: int) -> None:
@@ -51,6 +52,7 @@ def test_chains_from_one_point_reach_the_posterior(name: str, particles: int) ->
     assert 0.2 < float(chains.acceptance.mean()) < 0.999
 
 
+@pytest.mark.long
 def test_a_tempered_particle_by_itself_moves() -> None:
     torch.manual_seed(0)
     step = tempered(metropolis_hastings(drift("x")), sweeps=15, always_move=True)

@@ -114,6 +114,7 @@ LEARNT = [(name, case) for name in LEARNING for case in CASES if case != "on a t
 FEW = ("correlated", "two modes")  # a normal at each particle takes its time
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "case"), [(name, case) for name, case in LEARNT if name != "kernel density" or case in FEW]
 )
@@ -208,6 +209,7 @@ def test_mutant_that_steps_up_a_difference_only(monkeypatch: pytest.MonkeyPatch)
     assert worst_z(exact, differential_evolution("x"), functions) > BROKEN
 
 
+@pytest.mark.long
 def test_mutant_that_is_fitted_to_the_particles_it_moves() -> None:
     """Populations of four: halves that learn from each other keep the variance, all four from all do not."""
 

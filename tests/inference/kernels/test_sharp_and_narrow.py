@@ -38,6 +38,7 @@ KERNELS = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", KERNELS)
 def test_a_likelihood_a_million_times_as_sharp_as_the_prior(name: str) -> None:
     """With a smallest exponent of 1e-6 one particle was left, and log Z was -2e9."""
@@ -48,6 +49,7 @@ def test_a_likelihood_a_million_times_as_sharp_as_the_prior(name: str) -> None:
         assert float((population["x"] - 2.7).abs().max()) < 6e-6
 
 
+@pytest.mark.long
 def test_persistent_sampling_of_a_sharp_likelihood() -> None:
     torch.manual_seed(0)
     kernel = metropolis_hastings(drift("x"))
@@ -64,6 +66,7 @@ def in_units(size: float, small: float) -> Callable[[], None]:
     return program
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kernel", [hmc("x", "z"), metropolis_hastings(joint_drift("x", "z"))])
 def test_units_do_not_change_a_digit(kernel: Kernel) -> None:
     one, other = (run(in_units(*u), 5.5, 200, kernel, 0) for u in ((1.0, 1.0), (2.0**30, 2.0**-30)))
@@ -87,6 +90,7 @@ def ridge() -> tuple[Callable[[], None], Tensor, float]:
     return program, y, float(MultivariateNormal(torch.zeros(5).double(), spread).log_prob(y))
 
 
+@pytest.mark.long
 def test_hmc_moves_along_narrow_ridges() -> None:
     """Correlations that were shrunk by a tenth made its steps along the narrow axes unstable."""
     program, y, exact = ridge()

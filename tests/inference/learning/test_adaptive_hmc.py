@@ -191,6 +191,7 @@ def test_mutant_whose_criterion_lets_trajectories_turn_by_a_half(monkeypatch: py
 # ---- in programs of inference
 
 
+@pytest.mark.long
 def test_chains_warm_up_from_where_they_should_not_begin() -> None:
     torch.manual_seed(0)
     trace = generate(correlated, (), {"y": SEEN}, 100)[0]

@@ -102,6 +102,7 @@ def located() -> None:
     pyro.sample("seen", pyro.distributions.Normal(poses.transform(part, CORNERS), 0.0015).to_event(2))
 
 
+@pytest.mark.long
 def test_a_network_that_reads_points_learns_the_pose() -> None:
     torch.manual_seed(0)
     points = poses.transform(CENTER, CORNERS)

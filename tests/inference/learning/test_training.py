@@ -118,6 +118,7 @@ def test_training_ends_at_the_posterior_for_all_observations() -> None:
     assert len(record.losses) <= 500 and record.seconds > 0.0 and "held-out loss" in repr(record)
 
 
+@pytest.mark.long
 def test_training_by_the_evidence_bound_ends_at_one_posterior() -> None:
     guide, record = trained(
         lambda proposal: evidence_bound(proposal.given(SEEN), program, (), SEEN, samples=2)
@@ -128,6 +129,7 @@ def test_training_by_the_evidence_bound_ends_at_one_posterior() -> None:
     assert float(record.held_out.min()) == pytest.approx(-LOG_EVIDENCE, abs=1e-3)
 
 
+@pytest.mark.long
 def test_parameters_of_the_program_are_learned_by_the_bound() -> None:
     """The evidence N(y; 0, v + 1) of y = 3 is largest at v = 8."""
     log_scale = torch.nn.Parameter(number(0.0))
@@ -143,6 +145,7 @@ def test_parameters_of_the_program_are_learned_by_the_bound() -> None:
     assert float((2.0 * log_scale.detach()).exp()) == pytest.approx(8.0, rel=0.15)
 
 
+@pytest.mark.long
 def test_mutants_of_the_bounds_end_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without the density of the proposal, it is left no spread."""
     sound = objectives.simulate

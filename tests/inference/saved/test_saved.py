@@ -28,6 +28,7 @@ def assert_equal(first: dict[str, torch.Tensor], second: dict[str, torch.Tensor]
 SEEDS = (1, 2, 3)
 
 
+@pytest.mark.long
 def test_in_another_process_it_goes_on_as_here(tmp_path: Path) -> None:
     expected = {}
     for name, kept in KEPT.items():

@@ -68,6 +68,7 @@ CASES: dict[str, Callable[[], Any]] = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", CASES)
 def test_evidence_is_unbiased(case: str) -> None:
     particles = 200 if case == "never" else 30
@@ -83,6 +84,7 @@ def test_the_fully_adapted_filter_has_equal_weights() -> None:
         assert info.effective_sample_size == pytest.approx(50.0) and info.resampled == 1
 
 
+@pytest.mark.long
 def test_looking_ahead_and_optimal_proposals_lower_the_variance_of_the_evidence() -> None:
     bootstrap = log_ratios(auxiliary(), 50, 40).var()
     guided = log_ratios(auxiliary(optimal), 50, 40).var()

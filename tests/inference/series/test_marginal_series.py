@@ -126,6 +126,7 @@ def largest(values: Tensor) -> float:
     )
 
 
+@pytest.mark.long
 def test_pmmh_leaves_the_posterior_and_chains_that_estimate_again_do_not() -> None:
     torch.manual_seed(3)
     assert largest(chains_of(False, 3000, 25)) < 4.0
@@ -153,6 +154,7 @@ def smc_squared(seed: int, resample: Any, thetas: int = 60) -> tuple[float, floa
     return last.population.log_evidence, float(mean(last.population, "rho"))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("resample", [never, adaptive(systematic, 0.9)], ids=["never", "adaptive"])
 def test_smc_over_the_steps_is_smc_squared(resample: Any) -> None:
     grid, chance, exact = posterior(T)

@@ -171,6 +171,7 @@ def test_a_discrete_path_reaches_its_smoothing_distribution() -> None:
     assert float(((shares - exact) / (exact * (1 - exact) / 4000).sqrt()).abs().max()) < 4.0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "move", [metropolis_hastings(drift("rho", (0.5, 2.0))), hmc("rho", steps=3)], ids=["drift", "hmc"]
 )

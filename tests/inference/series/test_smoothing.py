@@ -52,6 +52,7 @@ def z_of(estimates: torch.Tensor, exact: torch.Tensor) -> torch.Tensor:
     return (estimates.mean(dim=0) - exact) / (estimates.std(dim=0) / math.sqrt(len(estimates)))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("resample", [never, adaptive(), always()], ids=["never", "adaptive", "always"])
 def test_paths_are_those_of_kalmans_smoother(resample: Any) -> None:
     count = 5 if resample is never else T

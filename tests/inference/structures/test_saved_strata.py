@@ -50,6 +50,7 @@ print(numbers(gone_on(strata)))
 """
 
 
+@pytest.mark.long
 def test_another_process_goes_on_with_equal_bits(tmp_path: Path) -> None:
     torch.manual_seed(0)
     strata = gone_on(generate_strata(summed, (3,), {"y": SEEN}, 40))

@@ -263,6 +263,7 @@ def evidence_ratios(repeats: int, particles: int, least: int) -> Tensor:
     return matrix(rows)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("least", [0, 4])
 def test_tempered_evidence_is_unbiased_with_fixed_exponents(least: int) -> None:
     torch.manual_seed(0)

@@ -83,6 +83,7 @@ def test_a_move_of_ones_own_is_given_the_tempered_target() -> None:
     assert powers == pytest.approx([0.3] * 3 + [1.0] * 3)
 
 
+@pytest.mark.long
 def test_old_sites_of_a_structure_that_was_lost_are_not_tempered() -> None:
     """Of ten particles two are left, mostly of the first structure: a jump reaches the other's factor."""
 

@@ -45,6 +45,7 @@ def test_without_errors_a_part_is_where_it_appears() -> None:
     assert np.allclose(truly, seen, atol=1e-9)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["grasp", "kinematic"])
 def test_a_part_appears_where_the_peg_meets_it(name: str) -> None:
     """The gap of the measured peg is off by tenths of a millimetre, and that to the apparent part is none."""
@@ -54,6 +55,7 @@ def test_a_part_appears_where_the_peg_meets_it(name: str) -> None:
     assert np.median(np.abs(seen)) < 1.3 * np.median(np.abs(perfect))
 
 
+@pytest.mark.long
 def test_an_arm_that_bends_seems_to_press_the_peg_into_the_part() -> None:
     assert np.median(with_error("bending")[1]) < np.median(with_error("none")[1]) - 3e-5
 

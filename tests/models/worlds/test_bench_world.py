@@ -268,6 +268,7 @@ def test_every_part_takes_its_peg_at_every_clearance(name: str) -> None:
         assert check_fit(hole, outline) == pytest.approx(clearance, abs=1e-5)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", PARTS)
 def test_a_peg_in_its_hole_is_free_by_its_clearance_and_no_more(name: str) -> None:
     """Half a clearance to each side: at 0.4 of it nothing is felt, at 0.6 the wall is."""

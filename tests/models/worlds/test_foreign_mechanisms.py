@@ -76,6 +76,7 @@ def turned(first, last):
     return (turns[0].inv() * turns[1]).magnitude()
 
 
+@pytest.mark.long
 def test_without_a_mechanism_the_recording_is_that_of_the_foreign_world(scene, plain):
     log = world.log_of(scene, "presses", "stiffer")
     usual = world.recording_of(scene, "presses", "stiffer", mechanisms.RATE, log)
@@ -86,6 +87,7 @@ def test_without_a_mechanism_the_recording_is_that_of_the_foreign_world(scene, p
     assert problems(plain.recording) == []
 
 
+@pytest.mark.long
 def test_a_peg_that_is_off_in_the_hand_touches_where_it_is_and_not_where_it_is_measured(grasped):
     assert np.abs(gaps(grasped, grasped.world_from_true_peg)).max() < 2e-5
     assert np.abs(gaps(grasped, grasped.log.world_from_peg)).max() > 1e-4
@@ -97,6 +99,7 @@ def test_a_peg_that_is_off_in_the_hand_touches_where_it_is_and_not_where_it_is_m
     )
 
 
+@pytest.mark.long
 def test_a_sudden_slide_moves_the_part_in_one_pressed_touch(scene, slid):
     way = middles(scene, slid.trace)
     moving = np.flatnonzero(np.linalg.norm(np.diff(way, axis=0), axis=1))

@@ -42,6 +42,7 @@ def spans(depth):
     return [(part[0], part[-1]) for part in np.split(ticks, 1 + np.flatnonzero(np.diff(ticks) > 60))]
 
 
+@pytest.mark.long
 def test_gap_at_the_true_poses_is_the_penetration_in_contact_and_positive_elsewhere(scene, log, recording):
     fewer = faults.resampled(recording, 100)
     windows = [
@@ -112,6 +113,7 @@ def test_faulty_recordings_have_no_problem_that_a_check_of_the_file_reports(reco
     assert problems(faulty) == []
 
 
+@pytest.mark.long
 def test_a_moved_part_is_touched_where_it_was_moved_to(recording):
     slow = faults.resampled(recording, 50)
     moved = faults.part_moved(slow, 0.02, 0.7)

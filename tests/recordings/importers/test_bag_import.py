@@ -81,6 +81,7 @@ def assert_same(imported: Imported, expected: Imported) -> None:
     assert problems(imported.recording) == []
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", bag_logs.KINDS)
 def test_a_bag_becomes_what_the_files_of_the_same_log_do(
     kind: str, bags: dict[str, Path], config: Path, by_files: Imported
@@ -257,6 +258,7 @@ def test_a_topic_needs_its_bag(config: Path, bags: dict[str, Path], folder: Path
         bag.command(bags["mcap"], folder / "bench.yaml")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", bag_logs.KINDS)
 def test_damage_is_one_sentence(kind: str, tmp_path: Path) -> None:
     def rows(types: bag_logs.Types) -> Any:
@@ -292,6 +294,7 @@ def test_damage_is_one_sentence(kind: str, tmp_path: Path) -> None:
     assert refused > 38  # a changed number in a message of a bag without checksums is not seen
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("mode", ["FILE", "MESSAGE", "STORAGE"])
 def test_compressed_bags(mode: str, tmp_path: Path, folder: Path, config: Path, by_files: Imported) -> None:
     from rosbags.rosbag2 import CompressionFormat, CompressionMode

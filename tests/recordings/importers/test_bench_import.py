@@ -104,6 +104,7 @@ def test_each_mistake_in_the_configuration_is_seen(name: str, written: tuple[Pat
     assert not agrees(command(mistaken), there)
 
 
+@pytest.mark.long
 def test_a_controllers_wrench_in_the_bases_axes(tmp_path: Path) -> None:
     there = bench_logs.truth(1)
     path = bench_logs.write(tmp_path, there, bench_logs.Log(in_base=True, more=STATED))
@@ -129,6 +130,7 @@ def test_a_stated_load_is_given_in_the_sensors_frame(written: tuple[Path, bench_
     assert agrees(command(stated), there)
 
 
+@pytest.mark.long
 def test_a_clock_that_is_set_between_two_touches_is_named(tmp_path: Path) -> None:
     log = bench_logs.Log(noise=(0.1, 0.005, 0.00002), bends=2e-5, jumps=(11.08, 0.03), seed=3003)
     report = "\n".join(command(bench_logs.write(tmp_path, bench_logs.truth(3003), log)).report)
@@ -136,6 +138,7 @@ def test_a_clock_that_is_set_between_two_touches_is_named(tmp_path: Path) -> Non
     assert "which is taken off" not in report.split("clocks:")[1].splitlines()[0]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("seed", "late"), [(0, 0.008), (2, -0.05), (5, 0.05)])
 def test_the_clock_is_estimated_from_contacts(seed: int, late: float, tmp_path: Path) -> None:
     there = bench_logs.truth(seed)

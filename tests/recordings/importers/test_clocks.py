@@ -66,6 +66,7 @@ WITHDRAWN_SMOOTHLY = replace(WITHDRAWN_SMOOTHLY, press=0.4562, dissipation=10.0,
 WITHDRAWN_SMOOTHLY = replace(WITHDRAWN_SMOOTHLY, pose_noise=2.6925e-5)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "arm",
     [

@@ -223,6 +223,7 @@ REASSEMBLE_MISTAKES: dict[str, Callable[[Path, Path], None]] = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("words", REASSEMBLE_MISTAKES)
 def test_damage_to_a_reassemble_file_is_one_sentence(words: str, tmp_path: Path) -> None:
     path, config = write_reassemble(tmp_path)
