@@ -5,13 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from contextlib import suppress
-from typing import NamedTuple
-
-from torch import Tensor
 
 from bcppl.errors import NoWeightError
 from bcppl.inference.approximations.approximation import Approximation
-from bcppl.inference.filters.screening import COPIES, Survivors, by_mode, screened, screened_and_moved
+from bcppl.inference.filters.screening import (
+    COPIES,
+    Assimilated,
+    by_mode,
+    screened,
+    screened_and_moved,
+)
 from bcppl.inference.filters.smcp3 import Pair, move_and_weight
 from bcppl.inference.filters.step import Observed
 from bcppl.inference.kernels.rejuvenation import Moved
@@ -26,15 +29,6 @@ AMPLE = 30.0  # the same, enough for any N
 # the measurement is tempered: of 75 particles 3 were left along a bent ridge, sure of a part of it.
 MOST, ROOM = 40, 40_000
 LEAST = 0.03  # of N: where the screening of copies leaves less, the measurement is tempered
-
-
-class Assimilated(NamedTuple):
-    """A population given one more measurement."""
-
-    population: Population  # of N particles
-    effective: float  # the effective sample size of all copies
-    origin: Tensor | None  # (N,) the particle that each copy was made of; None where each is its own
-    moved: Moved | None = None  # what moves before physics did, where there were any
 
 
 def assimilate(population: Population, observed: Observed, pair: Pair, least: int = 1) -> Assimilated | None:
@@ -64,7 +58,7 @@ def assimilate(population: Population, observed: Observed, pair: Pair, least: in
         return None
     effective = reached.effective_sample_size
     if times == 1:
-        return Assimilated(reached, effective, None)
+        return Assimilated(reached, effective)
     chosen = by_mode(reached, count)
     return Assimilated(reached.selected(chosen), effective, chosen // times)
 
@@ -84,11 +78,9 @@ def assimilate_screened(
     particles stays effective.
     """
     count, copies = len(population), max(least, COPIES)
-    few: Survivors | None = None
+    few: Assimilated | None = None
     with suppress(NoWeightError):
         few = screened_and_moved(population, before, observed, pair, moves, threshold * count, copies)
     with suppress(NoWeightError):
         few = few or screened(population, before, observed, pair, copies)
-    if few is None or few.population.effective_sample_size < LEAST * count:
-        return None
-    return Assimilated(few.population, few.population.effective_sample_size, few.origin, few.moved)
+    return None if few is None or few.effective < LEAST * count else few

@@ -29,8 +29,8 @@ from bcppl.arguments import number_within, whole_number
 from bcppl.devices import HOST, same_random_state, to_device
 from bcppl.inference.approximations.approximation import Approximation
 from bcppl.inference.approximations.gaussian import GaussianApproximation
-from bcppl.inference.filters.assimilation import Assimilated, assimilate, assimilate_screened
-from bcppl.inference.filters.screening import approximated, by_mode
+from bcppl.inference.filters.assimilation import assimilate, assimilate_screened
+from bcppl.inference.filters.screening import Assimilated, approximated, by_mode
 from bcppl.inference.filters.second_search import Searched, searched
 from bcppl.inference.filters.smc import Step, smc
 from bcppl.inference.filters.smcp3 import Pair

@@ -39,23 +39,25 @@ def approximated(population: Population) -> Callable[[Trace], Tensor]:
     return lambda trace: _cheap_log_density(trace, approximation)
 
 
-class Survivors(NamedTuple):
+class Assimilated(NamedTuple):
     """A population given one more measurement.
 
     Attributes:
         population: of N particles.
-        origin: (N,) which particle each was made of.
-        moved: what moves by the cheap target did; None without any.
+        effective: the effective sample size of all copies of which these were chosen, or their own.
+        origin: (N,) the particle that each was made of; None where each is its own.
+        moved: what moves by the cheap target did, before physics; None without any.
     """
 
     population: Population
-    origin: Tensor
+    effective: float
+    origin: Tensor | None = None
     moved: Moved | None = None
 
 
 def screened(
     population: Population, before: Any, observed: Observed, pair: Pair, copies: int = COPIES
-) -> Survivors:
+) -> Assimilated:
     """N particles given one more measurement, of copies that the cheap target has weighted.
 
     What physics has decided about a particle before stays with its copies.
@@ -72,7 +74,8 @@ def screened(
     """
     few, origin = _survivors(population, before, observed, pair, copies)
     decided = _beyond(population.trace[origin], before)
-    return Survivors(few.reweighed(_beyond(few.trace, few.approximation) - decided), origin)
+    simulated = few.reweighed(_beyond(few.trace, few.approximation) - decided)
+    return Assimilated(simulated, simulated.effective_sample_size, origin)
 
 
 def screened_and_moved(
@@ -83,7 +86,7 @@ def screened_and_moved(
     moves: Callable[[Population, Target], Moved],
     least: float,
     copies: int = COPIES,
-) -> Survivors | None:
+) -> Assimilated | None:
     """The same, where survivors are moved by the cheap target before each is simulated.
 
     What physics has decided before is divided out, and decided again for the particles where they are then.
@@ -111,7 +114,8 @@ def screened_and_moved(
     few = few.with_trace(few.trace.without_states())
     moved = moves(few, SurrogateTarget(log_density=approximated(few)))
     simulated = moved.population.reweighed(_beyond(moved.population.trace, few.approximation))
-    return Survivors(simulated, origin, moved) if simulated.effective_sample_size >= least else None
+    effective = simulated.effective_sample_size
+    return Assimilated(simulated, effective, origin, moved) if effective >= least else None
 
 
 def _survivors(
