@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from bcppl.recordings.importers.bench.clocks import lateness
+from bcppl.recordings.streams import Stream
 from tests.recordings.importers.touching_arms import TouchingArm, touching
 
 YIELDING = TouchingArm(dissipation=15.0, threshold=1000.0)  # presses for a while, however hard
@@ -89,3 +91,33 @@ def test_it_is_unknown_or_no_farther_off_than_three_spreads(arm: TouchingArm) ->
     force, position, late = touching(arm)
     found = lateness(force, position, within=0.1)
     assert found is None or abs(found.late - late) <= 3.0 * found.spread
+
+
+def apart(first: TouchingArm, second: TouchingArm, seconds: float) -> tuple[Stream, Stream, float]:
+    """The streams of touches after which the arm rests for so long, and touches again; between, s."""
+    (felt, path, _), (felt_later, path_later, _) = touching(first), touching(second)
+    rng = np.random.default_rng(0)
+    step = felt.step
+    steps = round((float(felt.times[-1]) + seconds) / step)
+    shift = float(felt.times[0]) + steps * step - float(felt_later.times[0])
+    idle = first.force_noise * rng.normal(size=(steps - len(felt.times), 3))
+    force = np.concatenate([felt.values, idle, felt_later.values])
+    still = np.arange(path.times[-1] + path.step, path_later.times[0] + shift, path.step)
+    rest = path.values[-1] + first.pose_noise * rng.normal(size=(len(still), 3))
+    position = Stream(
+        "position",
+        np.concatenate([path.times, still, path_later.times + shift]),
+        np.concatenate([path.values, rest, path_later.values - path_later.values[0] + path.values[-1]]),
+    )
+    return Stream("force", felt.times[0] + step * np.arange(len(force)), force), position, shift
+
+
+def test_a_clock_that_drifts_is_not_one_that_was_set() -> None:
+    one, other = replace(YIELDING, seed=1, late=0.01), replace(YIELDING, seed=2, late=0.04)
+    force, position, between = apart(one, other, seconds=400.0)
+    found = lateness(force, position, within=0.1, drifts=True)
+    assert found is not None and not found.contradicting
+    assert abs(found.drift - 0.03 / between) < max(3.0 * found.drift_spread, 3e-6)
+    # Clocks that do not drift cannot be apart by that much unless one was set.
+    steady = lateness(force, position, within=0.1)
+    assert steady is None or steady.contradicting

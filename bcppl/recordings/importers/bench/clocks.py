@@ -132,8 +132,7 @@ def lateness(force: Stream, position: Stream, within: float, drifts: bool = Fals
     steps = round(within / _COARSE)
     every = np.asarray(_COARSE * np.arange(-steps, steps + 1))
     separate = log_evidence(felt, coarse, noise, every)
-    evidence = _of_all(separate)
-    most, weight = evidence.max(axis=1), _weight(evidence)
+    weight = _weight(_of_all(separate))
     probable = every[weight > weight.max() - _IMPROBABLE]
     low, high = probable[0] - _COARSE, probable[-1] + _COARSE
     if high - low > _WIDEST:
@@ -153,14 +152,19 @@ def lateness(force: Stream, position: Stream, within: float, drifts: bool = Fals
     variance = share.sum(axis=0) @ np.square(lates - late)
     blind = _BLIND * position.step * max(1.0, position.step / _SLOW)
     spread = float(np.sqrt(variance + _LEAST**2 + np.square(blind)))
+    # Along the drift: at the ends of a long log clocks are farther apart than an estimate may be off.
+    behind = drift * (times - middle) / _COARSE
+    if margin := int(np.ceil(np.abs(behind).max())):
+        wider = np.asarray(_COARSE * np.arange(-steps - margin, steps + margin + 1))
+        separate = log_evidence(felt, coarse, noise, wider)
+    along = _shifted(separate, behind, margin)
     far = np.abs(every - late) > max(_FAR, 3.0 * spread)
+    most = _of_all(along).max(axis=1)
     if spread > _KNOWN or most[far].max(initial=0.0) > _RIVAL * most[~far].max(initial=0.0):
         return None
-    own = separate.reshape(len(felt), len(every), -1).max(axis=2)
-    expected = np.clip(late + drift * (times - middle), every[0], every[-1])
-    apart = np.abs(every - expected[:, None]) > max(_FAR, 3.0 * spread)
-    best_near, best_apart = (np.where(where, own, -np.inf).max(axis=1) for where in (~apart, apart))
-    contradicts = best_apart > best_near + _IMPROBABLE
+    own = along.reshape(len(felt), len(far), -1).max(axis=2)
+    there, here = (own[:, where].max(axis=1, initial=-np.inf) for where in (far, ~far))
+    contradicts = there > here + _IMPROBABLE
     return Lateness(
         late=float(late),
         spread=spread,
