@@ -39,7 +39,7 @@ from bcppl.inference.resampling import always
 from bcppl.inference.targets import POSTERIOR, Target
 from bcppl.models.peg_in_hole import model
 from bcppl.models.worlds.peg_in_hole import simulate_recording
-from bcppl.sweeps import in_order
+from bcppl.sweeps import swept
 from bcppl.traces import Trace
 
 PARTICLES = 75
@@ -200,11 +200,17 @@ def figure(results: Sequence[dict[str, Measured]]) -> Figure:
 def main() -> None:
     parser = options(__doc__ or "")
     parser.add_argument("--jobs", type=int, default=1, help="probes at a time")
+    parser.add_argument("--file", type=Path, help="where what comes of each probe is kept")
     parser.add_argument("--figure", type=Path, metavar="FILE", help="save a figure of the comparison")
     arguments = parser.parse_args()
     probes, sweeps = (1, 6) if arguments.quick else (4, 40)
     seeds = range(arguments.seed, arguments.seed + probes)
-    results = list(in_order(compare, [(seed, sweeps) for seed in seeds], arguments.jobs))
+    results = []
+    for (seed, _), found in swept(
+        compare, [(seed, sweeps) for seed in seeds], file=arguments.file, jobs=arguments.jobs
+    ):
+        results.append({name: Measured(*values) for name, values in found.items()})
+        print(f"probe {seed} done", flush=True)
 
     def median(name: str, field: str) -> float:
         return float(np.median([getattr(result[name], field) for result in results]))
