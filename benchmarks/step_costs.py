@@ -3,7 +3,7 @@
 Scenes of the accuracy bench, each with another part, are stepped by bare MuJoCo through the probe that
 `accuracy.py` plans, with the part at its true pose and with the contact that inference assumes. A part's
 pieces are convex, so that a round wall has as many as it has sides, and each that is touched gives up to four
-contacts: what a step costs depends on the part more than on anything else.
+contacts.
 """
 
 from __future__ import annotations

@@ -8,15 +8,9 @@ from contextlib import suppress
 
 from bcppl.errors import NoWeightError
 from bcppl.inference.approximations.approximation import Approximation
-from bcppl.inference.filters.screening import (
-    COPIES,
-    Assimilated,
-    by_mode,
-    screened,
-    screened_and_moved,
-)
+from bcppl.inference.filters.screening import COPIES, by_mode, screened, screened_and_moved
 from bcppl.inference.filters.smcp3 import Pair, move_and_weight
-from bcppl.inference.filters.step import Observed
+from bcppl.inference.filters.step import Assimilated, Observed
 from bcppl.inference.kernels.rejuvenation import Moved
 from bcppl.inference.population import Population
 from bcppl.inference.sizing import replicate

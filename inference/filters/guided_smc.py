@@ -30,11 +30,18 @@ from bcppl.devices import HOST, same_random_state, to_device
 from bcppl.inference.approximations.approximation import Approximation
 from bcppl.inference.approximations.gaussian import GaussianApproximation
 from bcppl.inference.filters.assimilation import assimilate, assimilate_screened
-from bcppl.inference.filters.screening import Assimilated, approximated, by_mode
+from bcppl.inference.filters.screening import approximated, by_mode
 from bcppl.inference.filters.second_search import Searched, searched
 from bcppl.inference.filters.smc import Step, smc
 from bcppl.inference.filters.smcp3 import Pair
-from bcppl.inference.filters.step import Observed, StepFunction, StepInfo, Stepped, descended
+from bcppl.inference.filters.step import (
+    Assimilated,
+    Observed,
+    StepFunction,
+    StepInfo,
+    Stepped,
+    descended,
+)
 from bcppl.inference.filters.tempering import Rejuvenated, resample_move, tempered
 from bcppl.inference.filters.view_search import is_refuted, searched_by_climbing
 from bcppl.inference.kernels import Kernel, metropolis_hastings, sequence, surrogate_transition

@@ -14,13 +14,13 @@ is; a poor one costs effective particles. In other moves it is the surrogate of 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from bcppl.inference.filters.smcp3 import Pair, move_and_weight
-from bcppl.inference.filters.step import Observed
+from bcppl.inference.filters.step import Assimilated, Observed
 from bcppl.inference.kernels.rejuvenation import Moved
 from bcppl.inference.kernels.staged import SurrogateTarget
 from bcppl.inference.population import Population
@@ -37,22 +37,6 @@ def approximated(population: Population) -> Callable[[Trace], Tensor]:
     """A surrogate of the log-density of a trace: what is approximated takes the place of physics."""
     approximation = population.approximation
     return lambda trace: _cheap_log_density(trace, approximation)
-
-
-class Assimilated(NamedTuple):
-    """A population given one more measurement.
-
-    Attributes:
-        population: of N particles.
-        effective: the effective sample size of all copies of which these were chosen, or their own.
-        origin: (N,) the particle that each was made of; None where each is its own.
-        moved: what moves by the cheap target did, before physics; None without any.
-    """
-
-    population: Population
-    effective: float
-    origin: Tensor | None = None
-    moved: Moved | None = None
 
 
 def screened(

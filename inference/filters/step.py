@@ -19,6 +19,7 @@ from torch import Tensor
 
 from bcppl.errors import InputError
 from bcppl.inference.kernels.kernel import takes
+from bcppl.inference.kernels.rejuvenation import Moved
 from bcppl.inference.population import Population, refuse_no_population
 from bcppl.inference.progress import watched
 from bcppl.traces.values import Value
@@ -34,6 +35,22 @@ class Observed(NamedTuple):
 
     args: tuple[Any, ...]
     observations: Mapping[str, Value]
+
+
+class Assimilated(NamedTuple):
+    """A population given one more measurement.
+
+    Attributes:
+        population: of N particles.
+        effective: the effective sample size of all copies of which these were chosen, or their own.
+        origin: (N,) the particle that each was made of; None where each is its own.
+        moved: what moves by the cheap target did, before physics; None without any.
+    """
+
+    population: Population
+    effective: float
+    origin: Tensor | None = None
+    moved: Moved | None = None
 
 
 class StepInfo(NamedTuple):
