@@ -41,15 +41,9 @@ def simulate_free_motion(stepper: Stepper, stamps: int) -> FreeMotion:
 
 def _box(part: Part) -> tuple[Array, Array]:
     """Centre (3,) and half sides (3,) of a part's bounding box, of mesh and pieces."""
-    points = [part.vertices]
     # A drawn prism may lie within the cylinder that is touched.
-    for piece in part.pieces:
-        if piece.kind == "hull":
-            points.append(np.asarray(piece.size))
-        else:
-            half = piece.size if piece.kind == "box" else np.asarray(piece.size)[[0, 0, 1]]
-            points += [piece.center[None] - half, piece.center[None] + half]
-    low, high = np.concatenate(points).min(axis=0), np.concatenate(points).max(axis=0)
+    points = np.concatenate([part.vertices, *(piece.bounds for piece in part.pieces)])
+    low, high = points.min(axis=0), points.max(axis=0)
     return 0.5 * (low + high), 0.5 * (high - low)
 
 

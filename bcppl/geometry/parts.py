@@ -40,6 +40,14 @@ class Piece:
     size: Array
     center: Array = field(default_factory=lambda: np.zeros(3))
 
+    @property
+    def bounds(self) -> Array:
+        """(2, 3) its least and largest coordinates in the part's frame, metres."""
+        if self.kind == "hull":
+            return np.array([np.min(self.size, axis=0), np.max(self.size, axis=0)])
+        half = self.size if self.kind == "box" else np.asarray(self.size)[[0, 0, 1]]
+        return np.array([self.center - half, self.center + half])
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Part:
