@@ -18,7 +18,8 @@ from torch.special import log_ndtr
 from bcppl.arrays import Array, Indices
 from bcppl.devices import numbers, on_device_of
 from bcppl.distributions.episodes.filter.branches import OF_CONTACT, Branches, Prior, Segments
-from bcppl.distributions.episodes.filter.switching_filter import BETWEEN, CLEAR, FAINT, RUBBING
+from bcppl.distributions.episodes.filter.free_rows import BETWEEN, CLEAR, RUBBING
+from bcppl.distributions.episodes.filter.pieces import FAINT
 
 _FREE = 64  # rows without contact at a time: they take memory
 
