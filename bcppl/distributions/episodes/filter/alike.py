@@ -19,7 +19,7 @@ from bcppl.arrays import Array, Indices
 from bcppl.devices import numbers, on_device_of
 from bcppl.distributions.episodes.filter.branches import OF_CONTACT, Branches, Prior, Segments
 from bcppl.distributions.episodes.filter.free_rows import BETWEEN, CLEAR, RUBBING
-from bcppl.distributions.episodes.filter.pieces import FAINT
+from bcppl.distributions.episodes.filter.switching_filter import FAINT
 
 _FREE = 64  # rows without contact at a time: they take memory
 

@@ -30,20 +30,6 @@ def squared_by(covariance: Array, column: Array, product: Array) -> float:
 
 
 @compiled
-def copy_vector(source: Array, target: Array) -> None:
-    """Copy (M,) numbers; numpy's assignment takes ten times as long to compile."""
-    for a in range(len(source)):
-        target[a] = source[a]
-
-
-@compiled
-def copy_matrix(source: Array, target: Array) -> None:
-    """Copy (M, M) numbers."""
-    for a in range(len(source)):
-        copy_vector(source[a], target[a])
-
-
-@compiled
 def begin_contact(mean: Array, covariance: Array, variances: Array) -> None:
     """Set the last parameters, those of a contact, to ones of which nothing is known but their variances."""
     for k in range(len(variances)):
