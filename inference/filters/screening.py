@@ -113,7 +113,9 @@ def _survivors(
         # What came with the measurement was drawn from the program.
         return now - then - (updated.trace.log_prob(*updated.drawn) if updated.drawn else 0.0)
 
-    by_cheap = move_and_weight(replicate(population, copies), pair, observed, ratio)
+    # All are moved: what has been simulated for where they were would be copied, and never asked for.
+    begun = population.with_trace(population.trace.without_states())
+    by_cheap = move_and_weight(replicate(begun, copies), pair, observed, ratio)
     chosen = by_mode(by_cheap, len(population))
     return by_cheap.selected(chosen), chosen // copies
 
