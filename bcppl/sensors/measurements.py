@@ -54,7 +54,7 @@ class Recording:
     peg: Part | None = None
     background: Mapping[str, Array] = field(default_factory=dict)
     truth: Array | None = None
-    model: str = "peg_in_hole"
+    model: str = "look_and_touch"
     source: str = ""
 
     def __repr__(self) -> str:
