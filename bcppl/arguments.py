@@ -73,8 +73,10 @@ def pose_problem(name: str, pose: Array) -> str | None:
     if not np.isfinite(pose).all():
         return f"{name} holds a number that is not finite; give finite ones, {POSE_NUMBERS}."
     norm = np.linalg.norm(pose[..., 3:], axis=-1)
-    if (np.abs(norm - 1.0) > 1e-3).any():
-        return f"{name} has a quaternion of length {norm.flat[0]:.4g}; give qw qx qy qz of unit length."
+    if (wrong := np.abs(norm - 1.0) > 1e-3).any():
+        return (
+            f"{name} has a quaternion of length {norm[wrong].flat[0]:.4g}; give qw qx qy qz of unit length."
+        )
     return None
 
 

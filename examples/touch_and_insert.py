@@ -24,7 +24,6 @@ from bcppl.arrays import Array
 from bcppl.inference.live import Filter, Sampler
 from bcppl.robot.execution import Executor, Limits
 from bcppl.robot.plan import Plan, probe_of
-from bcppl.sensors.candidates import named_apart
 
 LIMITS = Limits(force=60.0, speed=0.06, free_speed=0.25)
 LEAD = 0.02  # s from the newest reading to the first stamp of a plan
@@ -80,13 +79,14 @@ def execute(
 
 
 def move_to(arm: Arm, world_from_peg: Array, like: Plan, height: float) -> None:
-    """Go to a pose over a point high above all, at 0.1 m/s."""
+    """Go to a pose over a point high above all, at 0.1 m/s and 1 rad/s at most."""
     here, there = arm.read()[-1].world_from_peg, np.asarray(world_from_peg)
     knots = [each.copy() for each in (here, here, there, there)]
     knots[1][2] = knots[2][2] = max(height, here[2], there[2])
     times = [0.0]
     for one, other in itertools.pairwise(knots):
-        times.append(times[-1] + max(0.3, float(np.linalg.norm((one - other)[:3])) / 0.1))
+        turn = 2.0 * np.arccos(min(1.0, abs(float(one[3:] @ other[3:]))))
+        times.append(times[-1] + max(0.3, float(np.linalg.norm((one - other)[:3])) / 0.1, turn))
     plan = replace(
         like,
         name="on the way",
@@ -126,7 +126,7 @@ def touch_and_insert(
     live.settle()
     for _ in range(probes):
         best = live.next_probe().best
-        plan = named_apart(best.candidate, live.recording)
+        plan = live.named_apart(best.candidate)
         announce(plan, best.information_gain)
         move_to(arm, plan.world_from_peg[0], plan, high)
         touch(arm, live, plan)

@@ -104,8 +104,7 @@ def planned(
     """The candidates that satisfy the constraints, a table's height (m) among them."""
     if table is not None:
         number_within("--table is {}", table)
-        if recording.peg is not None:
-            constraints = [above_table(recording.peg, table), *constraints]
+        constraints = [above_table(recording.peg, table), *constraints]
     if isinstance(asked, Mapping):
         like = [m.action for m in recording.measurements]
         return plan_candidates(

@@ -15,7 +15,9 @@ from bcppl.untrusted.plain_xml import refuse_entities
 
 
 def corrected(file: str | Path, parent_from_child: Mapping[str, Array]) -> str:
-    """The text of a URDF file with other origins of some joints; all else, comments too, is as it was.
+    """The text of a URDF file with other origins of some joints; all else within its root is as it was.
+
+    Comments before and after the root are left out, and prefixes of namespaces may be others.
 
     Args:
         file: the URDF file.

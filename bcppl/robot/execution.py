@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from bcppl.arguments import number_within
 from bcppl.arrays import Array
 from bcppl.errors import InputError
-from bcppl.robot.commands import STEP, command_of, continued, interpolated_command, stamps_of
+from bcppl.robot.commands import ROUNDED, STEP, command_of, continued, interpolated_command, stamps_of
 from bcppl.robot.plan import Plan
 
 TARE = 10  # samples
@@ -41,11 +41,13 @@ class Limits(NamedTuple):
         force: N, over two samples in a row, at which the plan is aborted.
         speed: m/s, of motions that may touch: all but free ones.
         free_speed: m/s, of free ones.
+        turning: rad/s, of all.
     """
 
     force: float = 60.0
     speed: float = 0.1
     free_speed: float = 0.5
+    turning: float = 3.0
 
 
 class Executor:
@@ -62,9 +64,11 @@ class Executor:
     Attributes:
         probe: the command so far, with the stamps of all samples.
         stops: (s) when each guarded or searching motion was stopped, by its number in the plan.
-        contact_pose: (7,) measured when the last guarded motion was stopped; None where none was.
+        contact_pose: (7,) measured when the last guarded motion was stopped, or else when what follows met a
+            surface; None where nothing was met.
         tare: (3,) N; None before it is complete.
-        state: "aborted" where a limit was exceeded or the tare is none; "in hole" where `stop_at_hole` ended
+        state: "aborted" where a limit was exceeded, or would be because a motion was stopped early and the
+            next one has farther to go, or the tare is none; "in hole" where `stop_at_hole` ended
             it, which takes a contact before or, deep in a hole, with its walls; "no contact" where with
             `stop_at_hole` nothing was felt to the end: the part is elsewhere, or the sensor is dead.
         reason: of "aborted" and "no contact", one sentence.
@@ -105,6 +109,7 @@ class Executor:
         self.tare: Array | None = tare
         self._forces: list[Array] = []  # the first ones and the newest ones, N
         self._held: Array | None = None
+        self._landed = False  # by a guarded motion
         self._motion = np.clip(
             np.searchsorted(plan.times, stamps + 1e-9, side="right") - 1, 0, len(plan.manners) - 1
         )
@@ -137,12 +142,7 @@ class Executor:
         self._forces.append(np.asarray(force))
         of = int(self._motion[number])
         if violation := self._violation():
-            self._held = np.asarray(world_from_peg())
-            self.state = "aborted"
-            self.reason = (
-                f"plan {self.plan.name!r} was aborted at {stamps[number]:.2f} s, in a motion that is "
-                f"{self.plan.manners[of]}: {violation}"
-            )
+            self._abort(number, of, violation, world_from_peg)
             return True
         if number + 1 == len(stamps):
             self._finish()
@@ -158,11 +158,15 @@ class Executor:
             return False
         self.stops[following] = float(stamps[number + 1])
         self.probe = continued(self.probe, command_of(self.plan, self.stops), stamps[number + 1])
+        if too_fast := self._too_fast(float(stamps[number + 1])):
+            self._abort(number, of, too_fast, world_from_peg)
         return True
 
     def _violation(self) -> str:
         """What the newest sample violates, a limit or a condition of the tare; empty where nothing."""
         limit = math.inf if self.limits is None else self.limits.force
+        if not np.isfinite(self._forces[-1]).all():
+            return "the sensor read a force that is no number; see its cable and its driver."
         if self._pressed(limit):
             return f"the force exceeded the limit of {limit:g} N."
         if self.tare is not None or self.taken < TARE:
@@ -175,6 +179,34 @@ class Executor:
             return f"it was tared at {read:.0f} N, above {limit:g} N; give a `tare` without contact."
         self.tare = rest
         return ""
+
+    def _abort(self, number: int, of: int, why: str, world_from_peg: Callable[[], Array]) -> None:
+        self._held = np.asarray(world_from_peg())
+        self.state = "aborted"
+        self.reason = (
+            f"plan {self.plan.name!r} was aborted at {self.probe.stamps[number]:.2f} s, in a motion that is "
+            f"{self.plan.manners[of]}: {why}"
+        )
+
+    def _too_fast(self, after: float) -> str:
+        """Which limit the command would exceed after a time (s), for a motion was stopped; empty for none."""
+        if self.limits is None:
+            return ""
+        later = self.probe.command_times >= after - 1e-9
+        times, path = self.probe.command_times[later], self.probe.command[later]
+        of = np.searchsorted(self.plan.times, times[1:] - 1e-9, side="right") - 1
+        free = np.array([float(manner == "free") for manner in self.plan.manners])[of]
+        # Corners are rounded: the end of a free motion is led at the beginning of the next.
+        free = np.convolve(free, np.ones(ROUNDED + 1))[: len(free)]
+        limit = np.where(free > 0.0, self.limits.free_speed, self.limits.speed)
+        speed = np.linalg.norm(np.diff(path[:, :3], axis=0), axis=1) / np.diff(times)
+        if not (speed > limit * (1.0 + ROUNDING)).any():
+            return ""
+        worst = int((speed / limit).argmax())
+        return (
+            f"it was stopped early, and what follows would be led at {1e3 * speed[worst]:.0f} mm/s, over the "
+            f"limit of {1e3 * limit[worst]:.0f}; go back to where the stroke began, or take more time."
+        )
 
     def _finish(self) -> None:
         self.state = "finished"
@@ -197,10 +229,20 @@ class Executor:
         guarded = manner == "guarded" and bool(stamps[number + 1] < plan.times[of + 1])
         if guarded and pressed:
             self.contact_pose = np.array(world_from_peg())
-        if manner != "searching" or self._found_before(of):
+            self._landed = True
+        searching = manner == "searching" and not self._found_before(of)
+        held_up = False
+        if pressed and not self._landed and (manner == "held" or searching):
+            # It met nothing on its way down. What holds it up now is a lower surface, or the hole's bottom.
+            held_up = self._held_up(world_from_peg(), number)
+            if held_up and self.contact_pose is None:
+                self.contact_pose = np.array(world_from_peg())
+        if not searching:
             return guarded and pressed
-        # A peg that met nothing on its way down, and then something, is between the walls of the hole.
-        return pressed if self.contact_pose is None else self._sunk(world_from_peg(), number) > plan.sink
+        # What holds it from the side is the walls of the hole.
+        if pressed and not self._landed and not held_up:
+            return True
+        return self.contact_pose is not None and self._sunk(world_from_peg(), number) > plan.sink
 
     def _sunk(self, world_from_peg: Array, number: int) -> float:
         """How far (m) a peg is below its contact with a surface, along the commanded z, at a sample."""
@@ -208,6 +250,13 @@ class Executor:
         led = interpolated_command(self.probe, self.probe.stamps[number : number + 1])[0][0]
         along = Rotation.from_quat(led[[4, 5, 6, 3]]).inv()
         return float(along.apply(self.contact_pose[:3] - world_from_peg[:3])[2])
+
+    def _held_up(self, world_from_peg: Array, number: int) -> bool:
+        """Whether the spring presses a peg along the commanded z rather than across it: no wall does so."""
+        led = interpolated_command(self.probe, self.probe.stamps[number : number + 1])[0][0]
+        along = Rotation.from_quat(led[[4, 5, 6, 3]]).inv()
+        spring = along.apply(world_from_peg[:3] - led[:3]) * np.asarray(self.plan.stiffness)[:3]
+        return bool(spring[2] > np.linalg.norm(spring[:2]))
 
     def _found_before(self, motion: int) -> bool:
         """Whether the search that a motion belongs to has found its hole."""
@@ -221,7 +270,15 @@ class Executor:
 def _refuse_speed(plan: Plan, limits: Limits) -> None:
     for name, value in limits._asdict().items():
         number_within(f"the arm's limit of {name} is {{}}", value, above=0.0)
-    speeds = np.linalg.norm(np.diff(plan.world_from_peg[:, :3], axis=0), axis=1) / np.diff(plan.times)
+    spans, turns = np.diff(plan.times), Rotation.from_quat(plan.world_from_peg[:, [4, 5, 6, 3]])
+    speeds = np.linalg.norm(np.diff(plan.world_from_peg[:, :3], axis=0), axis=1) / spans
+    turning = (turns[:-1].inv() * turns[1:]).magnitude() / spans
+    if (fast := turning > limits.turning * (1.0 + ROUNDING)).any():
+        k = int(fast.argmax())
+        raise InputError(
+            f"motion {k} of plan {plan.name!r} turns the peg by {turning[k]:.2g} rad/s, over the arm's limit "
+            f"of {limits.turning:g}; give it more time, or another limit."
+        )
     for k, (speed, manner) in enumerate(zip(speeds, plan.manners, strict=True)):
         limit = limits.free_speed if manner == "free" else limits.speed
         if speed > limit * (1.0 + ROUNDING):

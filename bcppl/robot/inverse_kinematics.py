@@ -67,7 +67,7 @@ def joint_paths(
     share = torch.rand(_STARTS, len(robot.joints), generator=generator, dtype=torch.float64)
     share[0] = 0.5
     starts = low + share * (high - low) if near is None else torch.as_tensor(near).reshape(1, -1)
-    angles = starts.repeat(count, 1)
+    angles = starts.clamp(low, high).repeat(count, 1)
     mounted = None if link_from_tool is None else torch.as_tensor(link_from_tool)
     reached = torch.ones(len(angles), dtype=torch.bool)
     path = []

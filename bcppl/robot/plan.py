@@ -165,7 +165,9 @@ class InsertionPlan:
         return min(0.8 * self.depth, self.chamfer + 0.01)
 
     def push_from(self, world_from_peg: Array, sunk: float | None = None) -> Plan:
-        """The push, transformed as a whole to begin at a pose (7,) and shortened to end at the planned depth.
+        """The push, transformed as a whole to begin at a pose (7,) and to end at the planned depth.
+
+        It is no faster than planned: where it has farther to go, it takes longer.
 
         The peg has rotated with the hole that it is in, so the path is along its own axes.
 
@@ -182,6 +184,7 @@ class InsertionPlan:
         if sunk is None:
             sunk = -float(poses.transform(poses.inverse(start), pose[None, :3])[0, 2])
         length = float(path[:, 2].abs().max())
-        if length > 0.0:
-            path[:, :3] *= max(length - sunk, 0.0) / length
-        return replace(self.push, world_from_peg=poses.compose(pose, path).numpy())
+        share = max(length - sunk, 0.0) / length if length > 0.0 else 1.0
+        path[:, :3] *= share
+        times = self.push.times[0] + (self.push.times - self.push.times[0]) * max(share, 1.0)
+        return replace(self.push, times=times, world_from_peg=poses.compose(pose, path).numpy())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -63,10 +63,10 @@ def with_candidates(recording: Recording, candidates: Sequence[Candidate]) -> Re
     return replace(recording, measurements=[*recording.measurements, *blanks.values()])
 
 
-def named_apart(candidate: Candidate, recording: Recording) -> Candidate:
-    """The candidate under a name that no measurement of its kind in a recording has."""
+def named_apart(candidate: Candidate, recording: Recording, others: Collection[str] = ()) -> Candidate:
+    """The candidate under a name that no measurement of its kind in a recording has, nor is among others."""
     sensor: Any = planner_of(candidate)
-    taken = {_name(m.action) for m in recording.measurements if m.kind == sensor.kind}
+    taken = {_name(m.action) for m in recording.measurements if m.kind == sensor.kind} | set(others)
     name, number = sensor.name_of(candidate), 2
     free = name
     while free in taken:

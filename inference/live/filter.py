@@ -13,7 +13,7 @@ import threading
 import time
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
 from typing import Any, Literal, TypeVar
 
@@ -35,7 +35,7 @@ from bcppl.inference.planning.insertion import InsertionParameters, insertion_pl
 from bcppl.robot.arm_with_peg import ArmWithPeg
 from bcppl.robot.plan import InsertionPlan
 from bcppl.sensors import Measurement, Recording
-from bcppl.sensors.candidates import Candidate, with_candidates
+from bcppl.sensors.candidates import Candidate, named_apart, with_candidates
 from bcppl.traces import Model
 from bcppl.viewer.live import LivePage
 
@@ -94,6 +94,7 @@ class Filter:
         self._updates: deque[UpdateInfo] = deque(maxlen=KEPT)
         self._pages: list[LivePage] = []
         self._shared: dict[str, dict[str, Any]] = {}  # by kind and name, such as cameras
+        self._under_way = 0  # measurements
         self._failed: BaseException | None = None
         self._thread = Worker()
         try:
@@ -148,8 +149,8 @@ class Filter:
 
     @property
     def behind(self) -> int:
-        """How many measurements wait, those included that wait for earlier windows."""
-        return len(self._waiting)
+        """How many measurements are not assimilated, those included that wait for earlier windows."""
+        return len(self._waiting) + self._under_way
 
     def settle(self, timeout: float | None = None) -> Step:
         """Wait until everything that can be is assimilated, and return the newest step.
@@ -214,6 +215,11 @@ class Filter:
             )
         return self._run(ranked, timeout)
 
+    def named_apart(self, candidate: Candidate, others: Collection[str] = ()) -> Candidate:
+        """The candidate under a name that nothing which has arrived has, also if it was left out."""
+        arrived = [name for things in self._shared.values() for name in list(things)]
+        return named_apart(candidate, self._recording, [*arrived, *others])
+
     def insertion(
         self, parameters: InsertionParameters | None = None, timeout: float | None = None
     ) -> InsertionPlan:
@@ -257,7 +263,15 @@ class Filter:
         return page
 
     def close(self) -> None:
-        """End the filter's thread, and its pages; what waits is not assimilated."""
+        """End the filter's thread, and its pages; what waits is not assimilated.
+
+        Raises:
+            InputError: it is called within `on_update`, which runs in the thread that is to end.
+        """
+        if self._thread.inside:
+            raise InputError(
+                "on_update closes the filter whose thread it runs in; close it in another thread."
+            )
         self._thread.close()
         for page in self._pages:
             page.close()
@@ -283,12 +297,15 @@ class Filter:
             with self._changed:
                 late = bool(self._updates) and self._updates[-1].seconds > self.deadline
                 taken = self._waiting.take(join=late)
+                self._under_way = 0 if taken is None else taken[2]
             if taken is None:
                 return
             try:
                 self._update(*taken)
             except Exception as error:  # of a callback as well: the next call of `observe` or `settle` has it
                 self._failed = error
+            finally:
+                self._under_way = 0
 
     def _update(self, measurement: Measurement, arrived: float, joined: int) -> None:
         before = self._step
@@ -303,6 +320,8 @@ class Filter:
             options = {"particles": count, "seed": self.seed, "scene": scene, "start": start}
             for step in self._infer(self.model, recording, **options):
                 self._step, self._recording = step, recording
+            if self._step is before:
+                fault = f"{measurement.action!r} has been assimilated before: it is left out"
         except (InferenceError, InputError) as error:
             fault = str(error)
             self._step = before

@@ -108,6 +108,11 @@ class Sampler:
         """What was irregular, by stream."""
         return {name: messages.counts for name, messages in self._streams.items()}
 
+    @property
+    def missing(self) -> int:
+        """How many of the probe's stamps are in no window so far."""
+        return len(self.probe.stamps) - self._first
+
     def wrench(self, stamp: float, wrench: Sequence[float] | Array) -> list[Measurement]:
         """One message of the wrist sensor, and the windows that are complete with it.
 

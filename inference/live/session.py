@@ -49,6 +49,7 @@ class Session:
     def __init__(self, live: Filter) -> None:
         self.live = live
         self._sampler: Sampler | None = None
+        live.settle()  # the recording that it begins with is assimilated in its own thread
         probes = (getattr(m.action, "probe", None) for m in live.recording.measurements)
         self._names = {probe.name for probe in probes if probe is not None}
         self._lock = threading.Lock()  # of the sampler: who ranks or plans holds up nobody's samples
@@ -100,7 +101,6 @@ class Session:
 
     def _samples(self, request: Mapping[str, Any]) -> Answer:
         rows = {name: _rows(request, name, width) for name, width in (("wrench", 7), ("pose", 8))}
-        poses.as_pose(rows["pose"][:, 1:], "a sample's pose")
         count = 0
         refused: list[InputError] = []
         with self._lock:
@@ -108,6 +108,7 @@ class Session:
             for name, add in (("wrench", sampler.wrench), ("pose", sampler.pose)):
                 for row in rows[name]:
                     try:
+                        _refuse_row(name, row)
                         count += self._observe(add(float(row[0]), row[1:]))
                     except InputError as error:  # the rows after it are right, and are not sent again
                         refused.append(error)
@@ -119,7 +120,8 @@ class Session:
         with self._lock:
             sampler, self._sampler = self._begun(), None
             count = self._observe(sampler.finish())
-        return {"windows": count, "irregular": {name: vars(c) for name, c in sampler.counts.items()}}
+        irregular = {name: vars(c) for name, c in sampler.counts.items()}
+        return {"windows": count, "irregular": irregular, "missing": sampler.missing}
 
     def _view(self, request: Mapping[str, Any]) -> Answer:
         view = _read(_layout("view").candidate, request.get("camera"), "the camera")
@@ -130,19 +132,20 @@ class Session:
         return {"behind": self.live.behind}
 
     def _belief(self, _: Mapping[str, Any]) -> Answer:
-        belief = self.live.belief
+        step = self.live.step
+        belief = step.belief
         return {
             "mean": belief.mean.numpy(),
             "covariance": belief.covariance.numpy(),
             "effective": belief.effective_sample_size,
-            "measurements": self.live.step.taken,
+            "measurements": step.taken,
             "behind": self.live.behind,
         }
 
     def _next_probe(self, _: Mapping[str, Any]) -> Answer:
         best = self.live.next_probe(timeout=WAITS).best
-        planner = planner_of(best.candidate)
-        return {"plan": planner.candidate.tree(best.candidate), "gain": best.information_gain}
+        plan = self.live.named_apart(best.candidate, self._names)
+        return {"plan": planner_of(plan).candidate.tree(plan), "gain": best.information_gain}
 
     def _insertion(self, _: Mapping[str, Any]) -> Answer:
         plan = self.live.insertion(timeout=WAITS)
@@ -205,6 +208,11 @@ def _rows(request: Mapping[str, Any], name: str, width: int) -> Array:
         raise InputError(f"{name} is no list of rows of {width} numbers, the first the stamp.") from error
     if rows.ndim != 2 or rows.shape[1] != width:
         raise InputError(f"{name} has shape {rows.shape}; send (K, {width}), the first column the stamps.")
-    if not np.isfinite(rows).all():
-        raise InputError(f"{name} has a row with a number that is not finite; leave it out.")
     return rows
+
+
+def _refuse_row(name: str, row: Array) -> None:
+    if not np.isfinite(row).all():
+        raise InputError(f"{name} has a row with a number that is not finite; leave it out.")
+    if name == "pose":
+        poses.as_pose(row[1:], "a sample's pose")

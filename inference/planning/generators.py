@@ -45,6 +45,7 @@ _NEAR = 20  # points from among which the second touch of a pair is chosen
 _DOWNWARD = -0.5  # z of a normal of the underside
 _POSES = 9  # at which a slide is checked
 _REST = 0.15  # s before any motion, for the tare
+_BACK = 0.1  # m/s at most, of a way back
 # By which a leaning peg is turned: as in a probe that rocks (`metrology.ROCKED`).
 _LEAN, _TURN = ROCKED.lean, ROCKED.turn
 
@@ -173,7 +174,8 @@ def _insertions(problem: PlanningProblem, most: int) -> Iterator[InsertionPlan]:
 
 def _searches(problem: PlanningProblem, most: int) -> Iterator[Plan]:
     for plan in _insertions(problem, most):
-        yield _and_back(replace(plan.search, name="search #: spiral over the hole"))
+        search = replace(plan.search, name="search #: spiral over the hole")
+        yield _and_back(search, problem.insertion_parameters.free_speed)
 
 
 def _attempts(problem: PlanningProblem, most: int) -> Iterator[Plan]:
@@ -192,7 +194,7 @@ def _attempts(problem: PlanningProblem, most: int) -> Iterator[Plan]:
             _REST,
             float(np.linalg.norm(start[:3] - first[:3])) / parameters.free_speed + 0.05,
             (height + depth) / parameters.guarded_speed,
-            0.1,
+            max(0.1, parameters.press_depth / parameters.guarded_speed),
             parameters.dwell,
         ]
         yield _and_back(
@@ -204,17 +206,18 @@ def _attempts(problem: PlanningProblem, most: int) -> Iterator[Plan]:
                 parameters.contact_force,
                 np.array(parameters.stiffness),
                 np.array(parameters.damping),
-            )
+            ),
+            parameters.free_speed,
         )
 
 
-def _and_back(plan: Plan) -> Plan:
-    """The plan with a free motion back to where it begins."""
+def _and_back(plan: Plan, speed: float) -> Plan:
+    """The plan with a free motion back to where it begins, at a speed (m/s) of `_BACK` at most."""
     back = plan.world_from_peg[:1]
     length = float(np.linalg.norm(plan.world_from_peg[-1, :3] - back[0, :3]))
     return replace(
         plan,
-        times=np.append(plan.times, plan.times[-1] + max(length / 0.1, 0.1)),
+        times=np.append(plan.times, plan.times[-1] + max(length / min(speed, _BACK), 0.1)),
         world_from_peg=np.concatenate([plan.world_from_peg, back]),
         manners=(*plan.manners, "free"),
     )

@@ -13,8 +13,10 @@ from typing import NamedTuple
 import numpy as np
 import shapely
 
+from bcppl.arguments import number_within
 from bcppl.arrays import Array
 from bcppl.beliefs import Belief
+from bcppl.errors import InputError
 from bcppl.geometry.parts import Part
 from bcppl.inference.planning.faces import Side, TopPoints, points_on_top, section, sides
 from bcppl.inference.planning.waypoints import (
@@ -86,6 +88,15 @@ class MetrologyParameters(NamedTuple):
 ROCKED = MetrologyParameters(first_contact=1.5, lean=math.radians(4.0), turn=math.radians(8.0))
 
 
+def _checked(parameters: MetrologyParameters) -> MetrologyParameters:
+    for name, value in parameters._asdict().items():
+        if name in ("lean", "turn"):
+            number_within(f"a plan of 3-2-1 touches has {name} {{}} radians", value, least=0.0)
+        else:
+            number_within(f"a plan of 3-2-1 touches has {name} {{}}", value, above=0.0)
+    return parameters
+
+
 def three_two_one(
     belief: Belief, part: Part, peg: Part, parameters: MetrologyParameters | None = None
 ) -> Plan:
@@ -101,9 +112,9 @@ def three_two_one(
         parameters: of the plan.
 
     Raises:
-        InputError: the part's top has no room for the peg.
+        InputError: the part's top has no room for the peg, or a parameter is out of range.
     """
-    chosen = MetrologyParameters() if parameters is None else parameters
+    chosen = _checked(MetrologyParameters() if parameters is None else parameters)
     top = top_of(part)
     height = top - min(chosen.side_depth, 0.5 * float(part.extent[2]))
     radius = float(np.linalg.norm(peg.vertices[:, :2], axis=1).max())
@@ -281,6 +292,11 @@ def _timed(belief: Belief, waypoints: list[Waypoint], peg: Part, parameters: Met
         else:
             duration = parameters.first_contact + after.sum()
     begin = parameters.first_contact - spans[:first].sum() - 0.5 * spans[first]
+    if not begin > 0.0:
+        raise InputError(
+            f"the first contact is planned at first_contact = {parameters.first_contact:g} s, and the way "
+            f"there takes {parameters.first_contact - begin:.2g} s; give more time, or a higher free_speed."
+        )
     spare = duration - (begin + spans.sum())
     slides = (kinds == "held") & (lengths > 1.01 * parameters.press_depth)
     if spare > 0.0 and slides.any():  # slower slides are more informative

@@ -116,10 +116,11 @@ def _distances(
     return distances
 
 
-def above_table(peg: Part, height: float, margin: float = 0.002) -> Constraint:
+def above_table(peg: Part | None, height: float, margin: float = 0.002) -> Constraint:
     """Plans keep the peg's lowest point a margin (m) above a table of a height (m), views their sensor."""
     number_within("the table is {} m high", height)
-    corners = torch.from_numpy(np.ascontiguousarray(peg.mesh.convex_hull.vertices))
+    hull = np.zeros((1, 3)) if peg is None else np.ascontiguousarray(peg.mesh.convex_hull.vertices)
+    corners = torch.from_numpy(hull)
 
     def satisfies(candidate: Candidate) -> bool:
         motion, placement = motion_of(candidate), placement_of(candidate)

@@ -63,7 +63,8 @@ def insert(
         contact: the world's physics.
         world_from_part: (7,) true pose of the part; not used with a reality.
         part_from_hole: (7,) true pose of its hole.
-        error: (T, 6) of the measured wrench, N and N m; T as `samples_of` the plan.
+        error: (T, 6) of the measured wrench, N and N m; T as `samples_of` the plan. A push from higher up
+            takes longer, and begins again with those of its own.
         pose_error: (T, 6) of the peg's measured pose, m and radians, in the peg's axes.
         reality: in which the robot is wrong, and nothing slips any more; by default it is right.
     """
@@ -78,13 +79,15 @@ def insert(
         tare = (search.felt[:TARE, :3] + error[:TARE, :3]).mean(axis=0)
         last = torch.from_numpy(search.encoders[-1])
         measured = poses.retract(last, torch.from_numpy(pose_error[done - 1]))
+        pushed = plan.push_from(measured.numpy(), _below(search.contact_pose, measured))
+        left = np.pad(error[done:], ((0, max(0, len(stamps_of(pushed)) - len(error) + done)), (0, 0)), "wrap")
         push = execute(
-            plan.push_from(measured.numpy(), _below(search.contact_pose, measured)),
+            pushed,
             part,
             peg,
             contact,
             world_from_part,
-            error[done:],
+            left,
             after=search,
             tare=tare,
             reality=reality,
@@ -115,5 +118,5 @@ def _below(contact_pose: Array | None, world_from_peg: torch.Tensor) -> float | 
 
 
 def samples_of(plan: InsertionPlan) -> int:
-    """The largest number of samples of an insertion."""
+    """The number of samples of an insertion whose push begins where the top is expected, or below it."""
     return len(stamps_of(plan.search)) + len(stamps_of(plan.push))

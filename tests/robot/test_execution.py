@@ -10,7 +10,7 @@ import pytest
 from bcppl.arrays import Array
 from bcppl.errors import InputError
 from bcppl.robot.execution import Executor, Limits
-from bcppl.robot.plan import Plan
+from bcppl.robot.plan import InsertionPlan, Plan
 
 SPRING = 2000.0  # N/m of the arm, whose command leads the peg into a wall
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
@@ -174,3 +174,52 @@ def test_a_pressed_slide_is_no_faster_than_what_may_touch() -> None:
         Executor(slide, limits=Limits(speed=0.1, free_speed=0.5))
     # Speeds are those of the plan, whatever the clock.
     Executor(replace(slide, times=slide.times + 1.7e9), limits=Limits(speed=0.2))
+
+
+def test_a_surface_below_the_stroke_is_met_by_the_press_and_is_no_hole() -> None:
+    executor = Executor(search(), stop_at_hole=True)
+    executed(executor, wall=-0.0215)
+    assert executor.state == "finished" and executor.contact_pose is not None
+    assert executor.contact_pose[2] == pytest.approx(-0.0215)
+
+
+@pytest.mark.parametrize("at", [3, 60])
+def test_a_force_that_is_no_number_aborts(at: int) -> None:
+    executor = Executor(descent(), limits=Limits())
+    executed(executor, wall=-1.0, hits={at: np.nan})
+    assert executor.state == "aborted" and "no number" in executor.reason and executor.taken == at + 1
+
+
+def test_what_follows_a_stop_keeps_to_the_limits_too() -> None:
+    """After a stroke of 100 mm that is stopped at 10, what was 5 mm in a tenth of a second is 95."""
+    plan = descent(speed=0.1)
+    knots = plan.world_from_peg.copy()
+    knots[2:, 2] = -0.1, -0.105
+    short = replace(plan, times=np.array([0.0, 0.2, 1.2, 1.3]), world_from_peg=knots)
+    fastest = Executor(short)
+    executed(fastest, wall=-0.01)
+    speed = np.abs(np.diff(fastest.probe.command[:, 2])) / np.diff(fastest.probe.command_times)
+    assert fastest.state == "finished" and speed.max() > 0.6
+    executor = Executor(short, limits=Limits())
+    executed(executor, wall=-0.01)
+    assert executor.state == "aborted" and "over the limit of 500" in executor.reason
+    assert executor.commanded()[2] == pytest.approx(-0.01)
+
+
+def test_a_plan_that_turns_too_fast_is_refused() -> None:
+    turned = descent().world_from_peg.copy()
+    turned[3, 3:] = 0.0, 0.0, 0.0, 1.0
+    with pytest.raises(InputError, match=r"motion 2 of plan 'down' turns the peg by 16 rad/s"):
+        Executor(descent(world_from_peg=turned), limits=Limits())
+
+
+@pytest.mark.parametrize("above", [0.0, 0.004, 0.02])
+def test_a_push_that_begins_higher_takes_longer_and_is_no_faster(above: float) -> None:
+    knots = np.tile([0.0, 0.0, 0.0, *UPRIGHT], (3, 1))
+    knots[1:, 2] = -0.02
+    times, manners = np.array([0.0, 1.0, 1.2]), ("guarded", "held")
+    push = Plan("push", times, knots, manners, 20.0, np.ones(6), np.ones(6))
+    insertion = InsertionPlan(search(), push, np.array([0.0, 0.0, 0.0, *UPRIGHT]), 0.021, 0.0)
+    led = insertion.push_from(np.array([0.0, 0.0, above, *UPRIGHT]))
+    speed = np.linalg.norm(np.diff(led.world_from_peg[:, :3], axis=0), axis=1) / np.diff(led.times)
+    assert led.world_from_peg[-1, 2] == pytest.approx(-0.02) and speed.max() == pytest.approx(0.02)

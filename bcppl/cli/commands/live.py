@@ -92,7 +92,8 @@ def live(
     empty = replace(measured, measurements=[])
 
     def shown(step: Step, update: UpdateInfo) -> None:
-        report.row(step)
+        if not update.fault:
+            report.row(step)
 
     settings: dict[str, Any] = {"particles": particles, "seed": seed, "deadline": deadline}
     with Filter(chosen, empty, infer=infer, on_update=shown, **settings) as following:
@@ -133,7 +134,7 @@ def _asked(page: LivePage, console: Console) -> bool:
 
 def lateness(updates: Sequence[UpdateInfo], deadline: float) -> str:
     """How late updates were, in a sentence."""
-    late = sorted(update.seconds for update in updates)
+    late = sorted(update.seconds for update in updates if not update.fault)
     if not late:
         return "there was no update."
     within = sum(seconds <= deadline for seconds in late)

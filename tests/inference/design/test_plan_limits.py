@@ -1,0 +1,55 @@
+"""What a plan is said to keep to, it keeps to: speeds, forces, the path that is looked at for collisions."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bcppl.errors import InputError
+from bcppl.inference.planning.metrology import MetrologyParameters, three_two_one
+from bcppl.inference.planning.motions import free_path, pressing_force
+from bcppl.models.worlds.bench.scene import bench_scene
+from bcppl.robot.plan import Manner, Plan
+from tests.inference.design.test_touch_planning import about
+
+UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+
+
+def led(*heights: float, manner: Manner = "held") -> Plan:
+    """At rest, then from height to height (m), half a second each."""
+    knots = np.array([[0.0, 0.0, height, *UPRIGHT] for height in (heights[0], *heights)])
+    times, manners = 0.5 * np.arange(len(knots)), ("free", *(manner,) * (len(knots) - 2))
+    return Plan("press", times, knots, manners, 4.0, np.full(6, 1000.0), np.ones(6))
+
+
+def test_a_press_in_three_motions_is_as_strong_as_in_one() -> None:
+    assert pressing_force(led(0.0, -0.003, -0.006, -0.009)) == pytest.approx(9.0)
+    assert pressing_force(led(0.0, -0.009)) == pytest.approx(9.0)
+    assert pressing_force(led(0.0, 0.0, -0.009, 0.0)) == pytest.approx(9.0)
+
+
+def test_a_way_that_only_turns_is_looked_at_between_its_ends() -> None:
+    plan = led(0.0, 0.0, manner="free")
+    turned = plan.world_from_peg.copy()
+    turned[-1, 3:] = 0.0, 1.0, 0.0, 0.0
+    path = free_path(replace(plan, world_from_peg=turned))
+    cosines = np.abs(np.sum(path[1:, 3:] * path[:-1, 3:], axis=1)).clip(0.0, 1.0)
+    assert np.degrees(2.0 * np.arccos(cosines)).max() < 2.01 and len(path) > 90
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"free_speed": -0.1}, "3-2-1 touches has free_speed -0.1; give a finite number above 0"),
+        ({"guarded_speed": 0.0}, "has guarded_speed 0.0"),
+        ({"lean": -0.1}, "has lean -0.1 radians"),
+        ({"first_contact": 0.2}, "first_contact = 0.2 s, and the way there takes"),
+    ],
+)
+def test_parameters_of_three_two_one_are_checked(changed: dict[str, Any], words: str) -> None:
+    scene = bench_scene(5)
+    with pytest.raises(InputError, match=words):
+        three_two_one(about(scene, 0.001), scene.part, scene.peg, MetrologyParameters()._replace(**changed))
