@@ -27,9 +27,11 @@ class Arm(Protocol):
 
     Attributes:
         ahead: s after which a command takes effect.
+        settles: s for which it stands still before it takes up another stiffness.
     """
 
     ahead: float
+    settles: float
 
     def read(self) -> list[Reading]:
         """The readings since the last call, one at least; waits for it.

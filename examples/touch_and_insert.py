@@ -58,6 +58,12 @@ def execute(
     for a hole feels no contact.
     """
     readings = arm.read()[-1:]
+    # The clock of a plan begins when the arm is ready to follow it, or it would have to catch up.
+    ready = readings[0].stamp + arm.settles
+    while readings[-1].stamp < ready:
+        arm.command(plan.world_from_peg[0], plan.stiffness)
+        readings = arm.read()
+    readings = readings[-1:]
     plan = replace(plan, times=plan.times - plan.times[0] + readings[0].stamp + LEAD)
     executor = Executor(plan, tare=tare, stop_at_hole=stop_at_hole, limits=LIMITS)
     while executor.state == "moving":

@@ -41,6 +41,7 @@ class FrankaArm:
     """
 
     ahead = 3 * LAG + 0.001 * EVERY
+    settles = 0.001 * SETTLED + 0.1  # and until it follows again
 
     def __init__(self, host: str, realtime: bool = True, patience: float = 0.0) -> None:
         context = multiprocessing.get_context("spawn")

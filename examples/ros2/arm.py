@@ -35,7 +35,7 @@ class ROSArm:
         peg_from_sensor: (7,) pose of the wrist sensor, whose wrench is that of the environment on the peg.
     """
 
-    ahead = 0.01  # s
+    ahead, settles = 0.01, 0.0  # s
 
     def __init__(self, node: Node, peg_from_sensor: tuple[float, ...] | Array = UNMOVED) -> None:
         self._mounting = np.array(peg_from_sensor)

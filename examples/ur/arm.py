@@ -27,7 +27,7 @@ SILENT = 1.0  # s without a package, after which the arm is taken to have stoppe
 class URArm:
     """A connection to the arm (`readings.Arm`)."""
 
-    ahead = 0.008  # s
+    ahead, settles = 0.008, 0.0  # s
 
     def __init__(self, host: str) -> None:
         self._receive = rtde_receive.RTDEReceiveInterface(host, RATE, READ)

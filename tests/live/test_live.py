@@ -23,6 +23,7 @@ from bcppl.inference.live.waiting import Arrived, Waiting
 from bcppl.models import load_recording
 from bcppl.models.look_and_touch import model
 from bcppl.robot.motion import Probe
+from bcppl.robot.plan import Plan
 from bcppl.sensors import Measurement, ProbeWindow, Recording, Touch, View
 
 FEW = 20
@@ -325,3 +326,59 @@ def test_a_recording_is_played_at_the_pace_of_its_stamps(touched: Recording) -> 
     begin = float(touched.measurements[0].observation.times[0])
     assert at == pytest.approx([100.0 + 0.5 * (end - begin) for end in ends])
     assert len(list(play(touched, math.inf, sleep=sleep))) == len(touched.measurements)
+
+
+def test_an_image_that_arrives_twice_is_assimilated_once() -> None:
+    recording = load_recording("peg_probe")
+    view, *_ = recording.measurements
+    stages: list[str] = []
+
+    def updated(_: Any, update: Any) -> None:
+        stages.append(update.fault)
+
+    with Filter(model, replace(recording, measurements=[]), particles=FEW, on_update=updated) as live:
+        for _ in range(2):
+            live.observe(view.action, view.observation)
+            live.settle()
+        assert len(live.recording.measurements) == 1 and "before: it is left out" in stages[1]
+        assert not stages[0]
+
+
+def test_what_is_under_way_counts_as_not_assimilated_and_a_callback_cannot_close(touched: Recording) -> None:
+    begun, go_on, refused = threading.Event(), threading.Event(), []
+
+    def slow(model: Any, recording: Recording, **settings: Any) -> Iterator[Any]:
+        begun.set()
+        assert not recording.measurements or go_on.wait(20.0)
+        yield from guided_smc.infer(model, recording, **settings)
+
+    def closing(*_: Any) -> None:
+        with pytest.raises(InputError, match="close it in another"):
+            live.close()
+        refused.append(True)
+
+    with Filter(
+        model, replace(touched, measurements=[]), particles=FEW, infer=slow, on_update=closing
+    ) as live:
+        begun.clear()
+        live.observe(touched.measurements[0].action, touched.measurements[0].observation)
+        assert begun.wait(20.0) and live.behind == 1
+        go_on.set()
+        live.settle()
+        assert live.behind == 0 and refused
+
+
+def test_a_name_that_has_arrived_is_not_given_again(touched: Recording) -> None:
+    third = touched.measurements[2]
+    plan = standing(third.action.probe.name)
+    with Filter(model, replace(touched, measurements=[]), particles=FEW) as live:
+        assert live.named_apart(plan).name == plan.name
+        live.observe(third.action, third.observation)  # it waits for those before it
+        assert live.named_apart(plan).name == f"{plan.name} (2)"
+        assert live.named_apart(plan, [f"{plan.name} (2)"]).name == f"{plan.name} (3)"
+
+
+def standing(name: str) -> Plan:
+    knots = np.tile([0.0, 0.0, 0.1, 1.0, 0.0, 0.0, 0.0], (3, 1))
+    times = np.array([0.0, 1.0, 2.0])
+    return Plan(name, times, knots, ("free", "guarded"), 4.0, np.ones(6), np.ones(6))

@@ -208,8 +208,10 @@ def test_a_probe_that_is_not_over_keeps_its_samples_and_its_name(session: Sessio
     wrong = {"ask": "samples", "wrench": [[0.0] * 7, [np.nan] * 7], "pose": [[0.0] * 8]}
     assert "pose" in session.answer({**wrong, "wrench": [[0.0] * 7]})["error"]
     assert "not finite" in session.answer({**wrong, "pose": []})["error"]
-    assert session._sampler is not None and not session._sampler._streams["wrench"].times
-    assert session.answer({"ask": "end"})["windows"] == 0
+    streams = session._sampler and session._sampler._streams
+    assert streams and streams["wrench"].times == [0.0] and not streams["pose"].times  # rows that are right
+    ended = session.answer({"ask": "end"})
+    assert ended["windows"] == 0 and ended["missing"] == 100
     assert "there was a probe called 'first'" in session.answer(probe)["error"]
 
 
@@ -254,3 +256,13 @@ names = st.sampled_from(["plan", "name", "begin", "seconds", "rate", "wrench", "
 @given(words, st.dictionaries(names, json_like, max_size=5))
 def test_no_request_is_more_than_an_answer(session: Session, asked: str, fields: dict[str, Any]) -> None:
     assert isinstance(session.answer({**fields, "ask": asked}), dict)
+
+
+def test_a_session_knows_the_probes_of_the_recording_that_it_begins_with() -> None:
+    recording = load_recording("peg_probe")
+    window = next(m for m in recording.measurements if isinstance(m.action, ProbeWindow))
+    with Filter(model, replace(recording, measurements=[window]), particles=20) as live:
+        answer = Session(live).answer(
+            {"ask": "begin", "name": window.action.probe.name, "begin": 0.0, "rate": 100.0, "seconds": 1.0}
+        )
+    assert "there was a probe called" in answer["error"]

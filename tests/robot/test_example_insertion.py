@@ -22,7 +22,7 @@ TICK = 0.01  # s
 class DirectArm:
     """An arm whose clock goes on with each reading."""
 
-    ahead = TICK
+    ahead, settles = TICK, 0.0
 
     def __init__(self, scene: BenchScene) -> None:
         self._simulated = importlib.import_module("simulated_arm").SimulatedArm(scene, TICK)

@@ -171,6 +171,8 @@ def test_paths_are_within_the_limits_of_mimicking_joints(tmp_path: Path) -> None
     paths = joint_paths(geared, "tip", geared.base_from_link("tip", angles)[:, None].numpy())[:, 0]
     assert np.isfinite(paths[:, 0]).tolist() == [False, False, True, True, False, False]
     assert np.abs(paths - angles.numpy())[2:4].max() < 0.01
+    outside = geared.base_from_link("tip", angles[4:5])[:, None].numpy()
+    assert np.isnan(joint_paths(geared, "tip", outside, near=np.array([0.6]))).all()
     (tmp_path / "geared.urdf").write_text(FOLLOWED.replace("LOWER", "-1").replace('"0.1"', '"9"'))
     with pytest.raises(InputError, match="no value of joint 'shoulder' of geared is within its limits"):
         joint_paths(Robot(tmp_path / "geared.urdf", tip="tip"), "tip", poses.identity(1)[None].numpy())

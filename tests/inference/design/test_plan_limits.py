@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bcppl.arguments import pose_problem
+from bcppl.cli.candidates import planned
 from bcppl.errors import InputError
 from bcppl.inference.planning.metrology import MetrologyParameters, three_two_one
 from bcppl.inference.planning.motions import free_path, pressing_force
@@ -53,3 +55,15 @@ def test_parameters_of_three_two_one_are_checked(changed: dict[str, Any], words:
     scene = bench_scene(5)
     with pytest.raises(InputError, match=words):
         three_two_one(about(scene, 0.001), scene.part, scene.peg, MetrologyParameters()._replace(**changed))
+
+
+def test_without_a_peg_views_keep_above_the_table_too() -> None:
+    scene = bench_scene(5)
+    recording = replace(scene.look(), peg=None)
+    with pytest.raises(InputError, match="lead into the table"):
+        planned({"view": 3}, about(scene, 0.001), recording, [], 10.0, 0)
+
+
+def test_the_quaternion_that_is_wrong_is_named() -> None:
+    wrong = np.array([[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 2.0, 0.0, 0.0, 0.0]])
+    assert "quaternion of length 2;" in (pose_problem("a pose", wrong) or "")
