@@ -23,6 +23,7 @@ from pathlib import Path
 from pickle import PicklingError
 from typing import Any, NamedTuple, TypeVar
 
+from bcppl.arguments import named
 from bcppl.errors import InferenceError, InputError
 from bcppl.untrusted import strict_json
 
@@ -138,12 +139,22 @@ def as_they_end(
 
 
 def key_of(cell: Cell) -> str:
-    """What tells a cell from others: its JSON, names in their alphabetical order."""
-    return json.dumps(cell, sort_keys=True)
+    """What tells a cell from others: its JSON, names in their alphabetical order.
+
+    Raises:
+        InputError: the cell holds what JSON does not.
+    """
+    try:
+        return json.dumps(cell, sort_keys=True)
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"{named('a cell of a sweep is {}', cell)}, which JSON does not hold ({error}); give numbers, "
+            "text, lists and maps: int(seed), str(path)."
+        ) from error
 
 
 def kept(file: Path) -> dict[str, Any]:
-    """The results in a file by `key_of` their cells; a last line that was not finished does not count.
+    """The results in a file by `key_of` their cells; a last line without its end does not count.
 
     Raises:
         InputError: the file cannot be read, or holds something else.
@@ -154,11 +165,11 @@ def kept(file: Path) -> dict[str, Any]:
         raise InputError(f"{file} holds no results of a sweep ({error}); give another file.") from error
     found: dict[str, Any] = {}
     for number, line in enumerate(lines, 1):
+        if not line.endswith("\n"):
+            continue
         try:
             cell, result = strict_json.parsed(line, finite=False)
         except (ValueError, TypeError) as error:
-            if not line.endswith("\n"):
-                continue
             raise InputError(
                 f"line {number} of {file} is no result of a sweep ({error}); remove it, or give another file."
             ) from error

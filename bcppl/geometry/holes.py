@@ -79,7 +79,10 @@ def hole_of(part: Part, inside: tuple[float, float] | None = None, peg: Part | N
         raise InputError(
             f"part {part.name!r} has {len(first)} holes in its top, at {places} m; choose one with `inside`."
         )
+    # The middle of an outline that is bent may lie outside it.
     middle, rings = first[0].centroid, []
+    if not first[0].contains(middle):
+        middle = first[0].representative_point()
     for section in sections:
         around = [ring for ring in section if ring.contains(middle)]
         if not around:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -66,6 +67,11 @@ class Part:
     faces: Indices
     pieces: Sequence[Piece] = ()
     source: str = ""
+
+    @property
+    def middle(self) -> Array:
+        """(3,) of its bounding box, in its frame."""
+        return np.asarray(0.5 * (self.vertices.min(axis=0) + self.vertices.max(axis=0)))
 
     def __repr__(self) -> str:
         sides = " x ".join(f"{1000.0 * side:.3g}" for side in self.extent)
@@ -250,6 +256,16 @@ class Guess:
     tilt: float = 0.0
     yaw: float = 0.0
     angle: float | None = None
+
+    def farthest(self, point: Array) -> float:
+        """How far (m) a point (3,) of the part may be from where it is at the guess, within the bounds."""
+        about = float(np.linalg.norm(point))
+        if self.angle is not None:
+            swing = 2.0 * about * math.sin(0.5 * min(self.angle, math.pi))
+        else:
+            across = 2.0 * float(np.linalg.norm(point[:2])) * math.sin(0.5 * min(self.yaw, math.pi))
+            swing = across + 2.0 * about * math.sin(0.5 * min(self.tilt, math.pi))
+        return float(np.linalg.norm(self.translation)) + swing
 
 
 def load_mesh(

@@ -27,7 +27,7 @@ def region_of_interest(
         camera: of the image.
         part: the part to be localised.
         world_from_part: (7,) its expected pose.
-        within: bound of its displacement from there, metres; its rotation about its middle is arbitrary.
+        within: bound of the displacement of its middle from there, metres; its rotation is arbitrary.
         least: lower bound of each side's pixels, where the image has so many.
 
     Returns:
@@ -39,7 +39,7 @@ def region_of_interest(
     """
     camera_from_world = poses.inverse(camera.stated_pose())
     expected = poses.as_pose(world_from_part)
-    middle = torch.as_tensor(0.5 * (part.vertices.min(axis=0) + part.vertices.max(axis=0)))[None]
+    middle = torch.as_tensor(part.middle)[None]
     there = poses.transform(camera_from_world, poses.transform(expected, middle)).numpy()
     reach = float(np.linalg.norm(part.extent) / 2 + within)
     # All corners of the cube that it may fill: off the axis, the far face reaches farthest inwards.

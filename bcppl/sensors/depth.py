@@ -158,7 +158,7 @@ class DepthSensor(PlannedAsIs):
         middle = 0.5 * (whole.min(axis=0) + whole.max(axis=0))
         camera, distance = USUAL, DISTANCE
         if like is not None:
-            camera = like.camera
+            camera = replace(like.camera, device=like.camera.instrument)
             distance = float(np.linalg.norm(np.asarray(camera.world_from_camera)[:3] - middle))
         turn = float(np.random.default_rng([seed, 3]).uniform(0.0, 2.0 * math.pi))
         for k in range(count):
@@ -191,14 +191,28 @@ def _frame(camera: Camera) -> str:
 
 def _background(camera: Camera, recording: Recording) -> Iterator[str]:
     depth = recording.background.get(camera.name)
-    if depth is not None and depth.shape != (camera.height, camera.width):
-        yield (
-            f"the background of camera {camera.name!r} is {_size(depth)}, the camera {_frame(camera)} "
-            "pixels; give one of the camera's size."
-        )
+    where = f"the background of camera {camera.name!r}"
+    if depth is None:
+        return
+    if not isinstance(depth, np.ndarray):
+        yield f"{where} is of type {type(depth).__name__}; give a NumPy array, in metres."
+    elif depth.shape != (camera.height, camera.width):
+        yield f"{where} is {_size(depth)}, the camera {_frame(camera)} pixels; give one of the camera's size."
+    else:
+        yield from _numbers(where, depth[np.isfinite(depth) & (depth != 0)])
+
+
+def _numbers(where: str, read: Array) -> Iterator[str]:
+    if (read < 0).any():
+        yield f"{where}: {(read < 0).sum()} depths are negative; mark missing ones by NaN."
+    elif read.size and (middle := float(np.median(read))) > MOST_DEPTH:
+        yield f"{where}: the median depth is {middle:.0f}, probably millimetres; scale it by 0.001 to metres."
 
 
 def _depth(where: str, depth: Array, camera: Camera) -> Iterator[str]:
+    if not isinstance(depth, np.ndarray):
+        yield f"{where}: the depth image is of type {type(depth).__name__}; give a NumPy array, in metres."
+        return
     if depth.shape != (camera.height, camera.width):
         yield (
             f"{where}: the depth image is {_size(depth)}, camera {camera.name!r} {_frame(camera)} pixels; "
@@ -208,19 +222,19 @@ def _depth(where: str, depth: Array, camera: Camera) -> Iterator[str]:
     read = depth[np.isfinite(depth) & (depth != 0)]
     if read.size == 0:
         yield f"{where}: the depth image is missing in every pixel; leave the view out."
-    elif (read < 0).any():
-        yield f"{where}: the depth image has {(read < 0).sum()} negative depths; mark missing ones by NaN."
-    elif (middle := float(np.median(read))) > MOST_DEPTH:
-        yield f"{where}: the median depth is {middle:.0f}, probably millimetres; scale it by 0.001 to metres."
+    elif wrong := list(_numbers(where, read)):
+        yield from wrong
     elif not ((read >= camera.near) & (read <= camera.far)).any():
         yield (
             f"{where}: no depth lies within the range of camera {camera.name!r}, {camera.near:.4g} to "
-            f"{camera.far:.4g} m (median {middle:.4g} m); check the units and the range."
+            f"{camera.far:.4g} m (median {np.median(read):.4g} m); check the units and the range."
         )
 
 
 def _camera(what: str, camera: Camera, image: DepthImage, recording: Recording) -> Iterator[str]:
-    if camera.width < 1 or camera.height < 1 or not (camera.fx > 0 and camera.fy > 0):
+    if camera.width != int(camera.width) or camera.height != int(camera.height):
+        yield f"{what} is {camera.width} by {camera.height} pixels; give whole numbers."
+    elif camera.width < 1 or camera.height < 1 or not (camera.fx > 0 and camera.fy > 0):
         yield f"{what} has no pixels or no focal length; give its width, height, fx and fy in pixels."
     elif not np.isfinite([camera.fx, camera.fy, camera.cx, camera.cy]).all():
         yield f"{what} has intrinsics that are not finite; give fx, fy, cx and cy in pixels."

@@ -59,7 +59,10 @@ class BeamDistance(LazyDistribution):
         start, along = ray[:, :3].numpy(), rotation_matrix(ray)[:, :, 2].numpy()
         met, rows, faces = self.part.mesh.ray.intersects_location(start, along, multiple_hits=False)
         distance = torch.full((len(start),), self.beam.far, dtype=torch.float64)
-        distance[rows] = torch.from_numpy(np.linalg.norm(met - start[rows], axis=1))
+        away = np.linalg.norm(met - start[rows], axis=1)
+        within = away < self.beam.far  # what is farther is not met
+        met, rows, faces = met[within], rows[within], faces[within]
+        distance[rows] = torch.from_numpy(away[within])
         normal = self.part.mesh.face_normals[faces]
         normal = torch.from_numpy(normal / (normal * along[rows]).sum(axis=1, keepdims=True))
         turned = torch.linalg.cross(torch.from_numpy(np.asarray(met)), normal)

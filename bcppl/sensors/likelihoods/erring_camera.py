@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
-import numpy as np
 import pyro
 import pyro.distributions as dist
 import torch
@@ -95,7 +94,8 @@ class ErringCamera:
         self.viewpoints = viewpoints_of(recording)
         motion = partial(apparent_motion, shift=settings.camera_shift, turn=settings.camera_turn)
         self.error = InstrumentError(motion, settings.viewpoint)
-        within = float(np.linalg.norm(recording.guess.translation))
+        # The part turns about its frame's origin, which may be far from its middle.
+        within = recording.guess.farthest(recording.part.middle)
         guess, bins = recording.guess.world_from_part, settings.bins
         for camera in (m.action.camera for m in recording.measurements if isinstance(m.action, View)):
             if camera.name not in self.looks:
