@@ -29,7 +29,7 @@ from torch import Tensor
 from bcppl.arguments import latent_address, whole_number
 from bcppl.inference.kernels import Kernel, fitted, halved, halves, moved_by
 from bcppl.inference.kernels.kernel import refuse_no_kernel, scattered
-from bcppl.inference.population import Population
+from bcppl.inference.population import Population, refuse_no_population
 from bcppl.inference.progress import watched
 from bcppl.inference.resampling import Scheme, systematic
 from bcppl.inference.targets import POSTERIOR, Target
@@ -100,6 +100,7 @@ def markov_chains(
     warm_up = whole_number("chains are to warm up for {} moves", warm_up, least=0)
     if isinstance(start, Trace):
         start = Population(start)
+    refuse_no_population("markov_chains", start)
     population = start
     weights = population.log_weights
     if scheme is not None and bool((weights != weights[0]).any()):

@@ -270,6 +270,12 @@ class _Recorder(Messenger):
         axis = min(declared or plates, value.ndim) - 1
         if axis >= 0 and value.shape[axis] == self.particles:
             return value.movedim(axis, 0)
+        if self.particles in value.shape:
+            raise InputError(
+                f"deterministic site {message['name']!r} has shape {tuple(value.shape)}, and its axis of the "
+                f"{self.particles} particles is not where that of other sites is; open the plates of its "
+                "other axes around it, or have the particles first and give `event_dim`."
+            )
         return value.expand(self.particles, *value.shape)
 
     def _shared(self, value: Any, distribution: Any) -> Any:

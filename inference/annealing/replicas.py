@@ -22,6 +22,7 @@ from bcppl.inference.population import Population
 from bcppl.inference.progress import watched
 from bcppl.inference.targets import POSTERIOR, Target
 from bcppl.traces import Trace
+from bcppl.traces.verbs import refuse_no_trace
 
 
 class Replicas(NamedTuple):
@@ -75,6 +76,9 @@ def replica_exchange(
     refuse_no_kernel("replica_exchange", kernel)
     moves = whole_number("replicas are to make {} moves", moves)
     warm_up = whole_number("replicas are to warm up for {} moves", warm_up, least=0)
+    refuse_no_trace("replica_exchange", start)
+    if isinstance(exponents, float | int):
+        raise InputError(f"replicas are given the exponents {exponents}; give several, the last of them 1.")
     ladder = [number_within("a replica is given the exponent {}", e, least=0.0) for e in exponents]
     if ladder[-1:] != [1.0] or sorted(set(ladder)) != ladder or len(ladder) < 2:
         raise InputError(f"replicas are given the exponents {ladder}; give increasing ones that end with 1.")

@@ -19,6 +19,7 @@ from bcppl.errors import InputError
 from bcppl.inference.kernels.halving import halved, halves
 from bcppl.inference.kernels.kernel import Kernel, fitted, scattered
 from bcppl.inference.population import Population
+from bcppl.inference.proposals.spread import program_draws
 from bcppl.inference.targets import Target
 
 
@@ -133,7 +134,8 @@ def moved_by(population: Population, kernel: Kernel, target: Target, sweeps: int
     """Move every particle, `sweeps` times.
 
     The kernel that moves one half of the population is fitted to the other, so that no particle shapes its
-    own proposal, nor do its copies (`bcppl.inference.kernels.halving`).
+    own proposal, nor do its copies (`bcppl.inference.kernels.halving`). Where there is one particle, or all
+    are copies of one, it is fitted to draws of the program.
 
     Args:
         population: of N particles.
@@ -157,6 +159,10 @@ def moved_by(population: Population, kernel: Kernel, target: Target, sweeps: int
     return Moved(population, acceptance, float(sweeps.displaced(start, population).min()))
 
 
+def _of_program(population: Population) -> Population:
+    return Population(program_draws(population.trace), approximation=population.approximation)
+
+
 def _sweep(population: Population, kernel: Kernel, target: Target) -> tuple[Population, Tensor]:
     population = halved(population)
     if isinstance(target, Target):
@@ -164,7 +170,9 @@ def _sweep(population: Population, kernel: Kernel, target: Target) -> tuple[Popu
         target(population.trace)
     parts, shares = halves(population), []
     for mine, others in zip(parts, parts[::-1], strict=True):
-        move = fitted(kernel, population[others])
+        # Fitted to those that are moved it would not leave the target invariant, where no other is apart.
+        apart = population[others] if len(parts) > 1 else _of_program(population)
+        move = fitted(kernel, apart)
         moved, share = move(population.trace[mine], target)
         shares.append(share.to(torch.float64))
         population = population.with_trace(scattered(population.trace, mine, moved))

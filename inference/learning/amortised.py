@@ -33,6 +33,7 @@ from typing import Any
 from torch import Tensor
 
 from bcppl.traces import Trace
+from bcppl.traces.values import tensors
 
 # Samples latent values given observations (K, *event) by address, K being 1 or the number of particles, and
 # the arguments of the model's program.
@@ -57,7 +58,7 @@ class Amortised:
 
     def given(self, observations: Mapping[str, Tensor]) -> Callable[..., Any]:
         """The proposal program `program(*args)` for these observations, of the sites' event shape."""
-        observed = {address: value[None] for address, value in observations.items()}
+        observed = {address: value[None] for address, value in tensors(observations).items()}
         return lambda *args: self.guide(observed, *args)
 
     def __call__(self, trace: Trace) -> None:

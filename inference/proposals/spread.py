@@ -89,16 +89,21 @@ def weighted_places(population: Population, address: str) -> Places:
     return Places(coordinates, places, weights, unlearned, coordinates.rounding(places).square())
 
 
+def program_draws(trace: Trace) -> Trace:
+    """Particles whose latent values are drawn from the program of a trace, given what that has observed."""
+    program = trace.program
+    if isinstance(program, Stage):  # the states before its step stay
+        program = program.take(torch.arange(DRAWS) % trace.particles)
+    return constrained(program, trace.args, DRAWS, trace.observations, {})[0]
+
+
 def _prior_variance(trace: Trace, address: str) -> Tensor:
     """The variance (d,) of the prior along the axes of an address, from draws.
 
     The draws are of the program and not of the site at the particles' own values: a scale that depended on
     what is moved would not leave the target invariant. Their median serves where the prior has no variance.
     """
-    program = trace.program
-    if isinstance(program, Stage):  # the states before its step stay
-        program = program.take(torch.arange(DRAWS) % trace.particles)
-    drawn, _ = constrained(program, trace.args, DRAWS, trace.observations, {})
+    drawn = program_draws(trace)
     coordinates = coordinates_of(drawn, address)
     places = coordinates.places(drawn[address])
     steps = coordinates.steps(places, places.roll(1, dims=0))

@@ -29,7 +29,7 @@ from bcppl.arguments import number_within, whole_number
 from bcppl.distributions.lazy import LazyDistribution
 from bcppl.errors import InputError
 from bcppl.inference.series.nested import Filters
-from bcppl.inference.series.unrolling import numbered
+from bcppl.inference.series.unrolling import numbered, refuse_no_steps
 from bcppl.traces import Series, carried, extend, simulate
 from bcppl.traces.differentiation.graph import kept
 
@@ -132,6 +132,7 @@ class Marginal:
 
     def __call__(self, steps: Sequence[tuple[Any, ...]], *args: Any) -> None:
         """Sample the static parameters, and visit the observation of each step."""
+        refuse_no_steps("a marginal series", steps)
         with _Until(self.static) as parameters:
             self.series.init(*args)
         if missing := [address for address in self.static if address not in parameters.values]:

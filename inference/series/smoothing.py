@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -53,7 +54,7 @@ def smooth(filtered: Sequence[Population], draws: int) -> SeriesTrace:
         InferenceError: no particle of the last population has any weight.
     """
     draws = whole_number("a series is to be smoothed with {} draws", draws)
-    traces = [population.trace for population in filtered]
+    traces: list[Any] = [getattr(population, "trace", None) for population in filtered]
     if not traces or not all(isinstance(trace, SeriesTrace) for trace in traces):
         raise InputError("smooth is given no populations of a series; give a list, one after each step.")
     for first, second in pairwise([trace.steps for trace in traces if isinstance(trace, SeriesTrace)]):

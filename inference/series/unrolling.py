@@ -8,6 +8,8 @@ from typing import Any
 
 from pyro.poutine.messenger import Messenger
 
+from bcppl.arguments import named
+from bcppl.errors import InputError
 from bcppl.traces import Series
 
 
@@ -19,6 +21,7 @@ class Unrolled:
 
     def __call__(self, steps: Sequence[tuple[Any, ...]], *args: Any) -> Any:
         """Run `init(*args)` and a step with each of the arguments; returns the last state."""
+        refuse_no_steps("an unrolled series", steps)
         state = self.series.init(*args)
         for number, each in enumerate(steps, 1):
             with _Numbered(number):
@@ -37,6 +40,15 @@ def unrolled(series: Series) -> Unrolled:
         series: of which `init` and `step` are run; whether it keeps its history does not matter.
     """
     return Unrolled(series)
+
+
+def refuse_no_steps(what: str, steps: Any) -> None:
+    """Refuse what is no list of the arguments of each step."""
+    if not isinstance(steps, list | tuple) or not all(isinstance(each, list | tuple) for each in steps):
+        raise InputError(
+            f"{named(what + ' is given the steps {}', steps)}; give a list of the arguments of each step, "
+            "such as [()] * 3 for three steps without any."
+        )
 
 
 def numbered(address: str, number: int) -> str:
