@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -138,3 +139,12 @@ def test_a_belief_of_single_precision_is_made_double_and_one_that_is_not_finite_
         Belief(particles, weights(1, 1, 2))
     with pytest.raises(InputError, match="world_from_part as a ndarray; give a tensor"):
         Belief(particles.numpy(), weights(1, 1, 2))  # type: ignore[arg-type]
+
+
+def test_points_in_single_precision_and_poses_of_another_length() -> None:
+    around = poses.identity(3)
+    points = np.random.default_rng(0).normal(size=(20, 3)).astype(np.float32)
+    belief = Belief(around, torch.zeros(3, dtype=torch.float64))
+    assert belief.add(points, around[0].numpy()).abs().max() == 0.0
+    with pytest.raises(InputError, match="pose 0 of a belief has a quaternion of length 2;"):
+        Belief(2.0 * around, torch.zeros(3, dtype=torch.float64))

@@ -111,3 +111,25 @@ def test_a_file_of_something_else_is_refused(tmp_path: Path) -> None:
         list(swept(drawn, CELLS, file=file))
     with pytest.raises(InputError, match="share 4 of 3 does not exist"):
         list(swept(drawn, CELLS, share=(4, 3)))
+
+
+def test_a_result_without_the_end_of_its_line_is_found_again(tmp_path: Path) -> None:
+    file = tmp_path / "results.jsonl"
+    file.write_text('[{"seed": 0}, 1]\n[{"seed": 1}, 2]')
+    assert dict(
+        (cell["seed"], result) for cell, result in swept(plus_one, product(seed=range(3)), file=file)
+    ) == {
+        0: 1,
+        1: 2,
+        2: 3,
+    }
+    assert len(kept(file)) == 3
+
+
+def plus_one(cell: dict[str, int]) -> int:
+    return cell["seed"] + 1
+
+
+def test_a_cell_that_json_does_not_hold_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"PosixPath.*which JSON does not hold.*str\(path\)"):
+        list(swept(plus_one, product(seed=[tmp_path])))

@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 import pytest
+import shapely
 import trimesh
 
 from bcppl.errors import InputError
@@ -75,3 +76,9 @@ def test_a_peg_with_a_cone_is_as_wide_as_what_goes_in(length: float) -> None:
         fit_in(hole, coned(0.014, length))
     # What stays above the part is not asked for: this one is 8 mm wide where the hole ends, 14 mm at its top.
     assert fit_in(hole, coned(0.014, 0.075, tip=0.005)).clearance == pytest.approx(0.002, abs=1e-4)
+
+
+def test_the_middle_of_a_bent_hole_may_lie_outside_it() -> None:
+    corners = [(0, 0), (0.02, 0), (0.02, 0.004), (0.004, 0.004), (0.004, 0.02), (0, 0.02)]
+    hole = hole_of(block_with_hole(shapely.Polygon(corners)))
+    assert hole.through and hole.outline.area == pytest.approx(shapely.Polygon(corners).area)
