@@ -119,60 +119,6 @@ def test_a_result_without_the_end_of_its_line_is_found_again(tmp_path: Path) -> 
     results = {cell["seed"]: result for cell, result in swept(plus_one, product(seed=range(3)), file=file)}
     assert results == {0: 1, 1: 2, 2: 3}
     assert len(kept(file)) == 3
-    (tmp_path / "mended").touch()
-    assert dict((c["seed"], r) for c, r in swept(work, product(seed=range(4)), file=file)) == {
-        k: k for k in range(4)
-    }
-    assert file.read_text().startswith(before) and len(file.read_text().splitlines()) == 4
-
-
-@pytest.mark.long
-def test_a_process_that_dies_takes_no_other_result_with_it() -> None:
-    found = dict(as_they_end(dying, range(12), 2))
-    assert "SIGKILL" in found.pop(3).reason  # type: ignore[union-attr]
-    assert found == {k: k for k in range(12) if k != 3}
-    assert list(in_order(lambda k: k + 1, range(5), 2)) == [1, 2, 3, 4, 5]
-
-
-@pytest.mark.long
-def test_a_sweep_that_is_killed_goes_on(tmp_path: Path) -> None:
-    file = tmp_path / "results.jsonl"
-    command = [sys.executable, "-c", SLOW, str(file)]
-    with subprocess.Popen(command, start_new_session=True) as process:
-        while len(kept(file)) < 5:
-            time.sleep(0.02)
-        os.killpg(process.pid, signal.SIGKILL)
-    known = len(kept(file))
-    assert 5 <= known < 40
-    with file.open("a") as lines:
-        lines.write('[{"seed": 39}, 15')  # as a machine leaves it that stops while it writes
-    subprocess.run(command, check=True)
-    assert kept(file) == {key_of({"seed": k}): k * k for k in range(40)}
-    assert len(file.read_text().splitlines()) == 40
-
-
-def test_a_file_of_something_else_is_refused(tmp_path: Path) -> None:
-    file = tmp_path / "notes.txt"
-    keep(file, {"seed": 0}, 1)
-    assert kept(file) == {'{"seed": 0}': 1}
-    file.write_text("not results\n" + file.read_text())
-    with pytest.raises(InputError, match=r"line 1 of .*notes.txt is no result of a sweep"):
-        list(swept(drawn, CELLS, file=file))
-    with pytest.raises(InputError, match="share 4 of 3 does not exist"):
-        list(swept(drawn, CELLS, share=(4, 3)))
-
-
-def test_a_result_without_the_end_of_its_line_is_found_again(tmp_path: Path) -> None:
-    file = tmp_path / "results.jsonl"
-    file.write_text('[{"seed": 0}, 1]\n[{"seed": 1}, 2]')
-    assert dict(
-        (cell["seed"], result) for cell, result in swept(plus_one, product(seed=range(3)), file=file)
-    ) == {
-        0: 1,
-        1: 2,
-        2: 3,
-    }
-    assert len(kept(file)) == 3
 
 
 def plus_one(cell: dict[str, int]) -> int:

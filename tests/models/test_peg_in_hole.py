@@ -157,6 +157,7 @@ def test_what_is_explained_of_a_probe_is_a_setting() -> None:
     given = {"evidence": ("contacts in time", "pose", "wrench"), "friction": (0.3, 0.4)}
     chosen = peg_in_hole.prepare(recorded(), **given)
     actions, values = [m.action for m in measurements], chosen.observed(measurements)
+    torch.manual_seed(0)  # of these parts one at least is touched in the window
     trace, _ = generate(peg_in_hole.peg_in_hole, (chosen, actions), values, count)
     kinds = {address.split("_")[0] for address in trace.observations}
     assert kinds == {"depth", "contacts", "peg", "wrench"}
