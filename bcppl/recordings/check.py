@@ -109,6 +109,10 @@ def _types(recording: Recording) -> Iterator[str]:
     for name, (type_, wanted) in TYPES.items():
         if not isinstance(value := getattr(recording, name), type_):
             yield f"the recording's {name} is {_kind(value)}; give {wanted}."
+    for name, body in (("part", recording.part), ("peg", recording.peg)):
+        for field in ("vertices", "faces"):
+            if isinstance(body, Part) and not isinstance(array := getattr(body, field), np.ndarray):
+                yield f"the {name}'s {field} are {_kind(array)}; give a NumPy array."
     if isinstance(recording.measurements, Sequence):
         for index, each in enumerate(recording.measurements):
             if not isinstance(each, Measurement):

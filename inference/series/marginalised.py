@@ -14,7 +14,7 @@ over the steps with such moves is SMC^2 (Chopin, Jacob and Papaspiliopoulos, JRS
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -152,7 +152,7 @@ class Marginal:
 
     def _event_shape(self, args: tuple[Any, ...], step: tuple[Any, ...]) -> tuple[int, ...]:
         """The shape of the observation, from one run of a step with arguments of this kind."""
-        kind = _kind(step)
+        kind = _kind((args, step))
         if kind not in self._shapes:
             with torch.random.fork_rng(devices=[]):
                 trace, _ = extend(simulate(self.series, args), step, {})
@@ -170,6 +170,8 @@ def _kind(value: Any) -> Hashable:
     """What an observation's shape may depend on: shapes and whole numbers, but no number that is measured."""
     if isinstance(value, list | tuple):
         return tuple(_kind(each) for each in value)
+    if isinstance(value, Mapping):
+        return tuple((key, _kind(each)) for key, each in value.items())
     if isinstance(value, Tensor | np.ndarray) and value.ndim:
         return tuple(value.shape)
     return value if isinstance(value, int | str) else type(value).__name__

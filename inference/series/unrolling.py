@@ -22,7 +22,8 @@ class Unrolled:
     def __call__(self, steps: Sequence[tuple[Any, ...]], *args: Any) -> Any:
         """Run `init(*args)` and a step with each of the arguments; returns the last state."""
         refuse_no_steps("an unrolled series", steps)
-        state = self.series.init(*args)
+        with _Unnumbered(len(steps)):
+            state = self.series.init(*args)
         for number, each in enumerate(steps, 1):
             with _Numbered(number):
                 state = self.series.step(state, *each)
@@ -64,6 +65,22 @@ def by_step(addresses: Sequence[str], steps: int) -> list[list[str]]:
         number = int(ending) if name and ending.isdecimal() and int(ending) <= steps else 0
         visited[number].append(name if number else address)
     return visited
+
+
+class _Unnumbered(Messenger):
+    """Refuses addresses of `init` that are those of a step's."""
+
+    def __init__(self, steps: int) -> None:
+        super().__init__()
+        self.steps = steps
+
+    def _pyro_sample(self, message: Any) -> None:
+        name, _, ending = message["name"].rpartition("/")
+        if name and ending.isdecimal() and 0 < int(ending) <= self.steps:
+            raise InputError(
+                f"a series' `init` samples {message['name']!r}, which is {name!r} of step {int(ending)}; "
+                "name it otherwise."
+            )
 
 
 class _Numbered(Messenger):

@@ -214,3 +214,13 @@ def test_a_run_prints_doubts_and_keeps_them(tmp_path: Path, monkeypatch: pytest.
     assert ran.exit_code == 0, ran.output
     assert ran.output.index("doubt: the peg is [late].") < ran.output.index("push 1")
     assert json.loads((tmp_path / "run" / "run.json").read_text())["doubts"] == ["the peg is [late]."]
+
+
+def test_a_number_beyond_the_range_for_what_is_not_seen_is_no_doubt() -> None:
+    recording = load_recording("peg_probe")
+    view, *_ = recording.measurements
+    unseen = np.random.default_rng(0).random(view.observation.depth.shape) < 0.6
+    for code in (np.nan, 65.535):
+        depth = np.where(unseen, code, view.observation.depth).astype(np.float32)
+        seen = dataclasses.replace(view, observation=dataclasses.replace(view.observation, depth=depth))
+        assert doubts(dataclasses.replace(recording, measurements=[seen])) == []

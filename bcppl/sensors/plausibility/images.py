@@ -48,7 +48,7 @@ class Fit(NamedTuple):
 
 
 def thinned(camera: Camera, depth: Array) -> Seen:
-    """The image at every so manyth pixel, with depths of 0 and beyond the range missing."""
+    """The image at every so manyth pixel, with depths of 0 missing."""
     step = max(1, round(camera.width / WIDE))
     values = np.array(depth[::step, ::step], dtype=float)
     values[values == 0.0] = np.nan
@@ -67,7 +67,10 @@ class Images:
     def scores(self, seen: Seen, pose: Array) -> tuple[Array, Indices]:
         """Scores (N,) of poses (N, 7), and the numbers (N,) of pixels that they are the sum of."""
         hits = self._caster.hits(seen.camera, pose)
-        off = np.abs(seen.depth.reshape(-1)[hits.pixel] - hits.depth)
+        read = seen.depth.reshape(-1)[hits.pixel]
+        # Many cameras give a number beyond their range for what they do not see.
+        read = np.where((read >= seen.camera.near) & (read <= seen.camera.far), read, np.nan)
+        off = np.abs(read - hits.depth)
         known = np.isfinite(off)
         each = np.log(OUTLIERS + (1.0 - OUTLIERS) * SPAN / (2.0 * SHARP) * np.exp(-off[known] / SHARP))
         counts = np.bincount(hits.particle[known], minlength=len(pose)).astype(np.int64)

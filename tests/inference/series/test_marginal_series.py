@@ -340,3 +340,28 @@ def test_a_gradient_of_what_filters_estimate_is_refused() -> None:
     program = marginal(AUTOREGRESSION, "rho", observed="y", particles=5)
     with gradients(), pytest.raises(InputError, match="pass no gradient on"):
         generate(program, ([()],), observed(1), 3)
+
+
+def test_shapes_may_differ_from_call_to_call_with_what_init_and_step_are_given() -> None:
+    """`init` draws vectors of a length that is an argument; a step sees those that a map names."""
+
+    def init(length: int) -> Tensor:
+        rho = pyro.sample("rho", dist.Beta(torch.tensor(2.0).double(), 2.0))
+        return rho[:, None].expand(-1, length)
+
+    def step(state: Tensor, seen: dict[str, Tensor]) -> Tensor:
+        pyro.sample("y", dist.Normal(state[:, seen["which"]], 1.0).to_event(1))
+        return state
+
+    program = marginal(Series(init, step), "rho", observed="y", particles=4)
+    for length, which in ((2, [0, 1]), (3, [0, 1, 2]), (3, [1])):
+        values = {"y/1": torch.zeros(len(which), dtype=torch.float64)}
+        _, log_weights = generate(program, ([({"which": torch.tensor(which)},)], length), values, 5)
+        assert bool(torch.isfinite(log_weights).all())
+
+
+def test_a_number_of_steps_is_no_list_of_them() -> None:
+    program = marginal(AUTOREGRESSION, "rho", observed="y", particles=4)
+    for given in (3, [1, 2]):
+        with pytest.raises(InputError, match=r"give a list of the arguments of each step"):
+            generate(program, (given,), {}, 5)

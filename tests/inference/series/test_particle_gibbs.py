@@ -230,3 +230,12 @@ def test_a_parameter_that_stays_weighs_what_it_depends_on() -> None:
     drawn = trace["precision"]
     exact = dist.Gamma(2.5, 2.0 + 0.5 * rho**2).mean
     assert abs(float((drawn.mean() - exact) / (drawn.std() / math.sqrt(count)))) < 4.0
+
+
+def test_an_address_of_init_that_is_one_of_a_steps_is_refused() -> None:
+    def begin() -> dict[str, Tensor]:
+        return {"rho": number(0.5), "x": pyro.sample("x/1", dist.Normal(number(0.0), 1.0))}
+
+    with pytest.raises(InputError, match=r"samples 'x/1', which is 'x' of step 1; name it otherwise"):
+        simulate(unrolled(Series(begin, AUTOREGRESSION.step)), ([()] * 2,), 3)
+    simulate(unrolled(Series(begin, AUTOREGRESSION.step)), ([],), 3)
