@@ -94,13 +94,7 @@ class Belief:
             )
         if len(wrong := (~torch.isfinite(self.world_from_part)).nonzero()):
             raise InputError(f"pose {int(wrong[0, 0])} of a belief is not finite; give numbers, in metres.")
-        length = self.world_from_part[:, 3:].norm(dim=1)
-        if len(wrong := ((length - 1.0).abs() > 1e-3).nonzero()):
-            at = int(wrong[0, 0])
-            raise InputError(
-                f"pose {at} of a belief has a quaternion of length {float(length[at]):.4g}; give qw qx qy qz "
-                "of unit length."
-            )
+        as_pose(self.world_from_part, "a pose of a belief")
 
     def __len__(self) -> int:
         return len(self.log_weights)

@@ -139,7 +139,7 @@ def build_model(part: Part, peg: Part, parameters: ContactParameters) -> mujoco.
     # A chunk of a rollout begins without a warm start: without any, chunks equal the whole to the bit.
     option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_WARMSTART)
     option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
-    # One free body is one island; looking for others takes 2 to 5 % of a step.
+    # One free body is one island: to look for others takes time.
     option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
 
     # The order of the mocap bodies is the order of their poses in `mujoco.rollout`'s control.

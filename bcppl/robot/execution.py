@@ -109,7 +109,6 @@ class Executor:
         self.tare: Array | None = tare
         self._forces: list[Array] = []  # the first ones and the newest ones, N
         self._held: Array | None = None
-        self._landed = False  # by a guarded motion
         self._motion = np.clip(
             np.searchsorted(plan.times, stamps + 1e-9, side="right") - 1, 0, len(plan.manners) - 1
         )
@@ -229,10 +228,10 @@ class Executor:
         guarded = manner == "guarded" and bool(stamps[number + 1] < plan.times[of + 1])
         if guarded and pressed:
             self.contact_pose = np.array(world_from_peg())
-            self._landed = True
+        landed = any(plan.manners[k] == "guarded" for k in self.stops)
         searching = manner == "searching" and not self._found_before(of)
         held_up = False
-        if pressed and not self._landed and (manner == "held" or searching):
+        if pressed and not landed and (manner == "held" or searching):
             # It met nothing on its way down. What holds it up now is a lower surface, or the hole's bottom.
             held_up = self._held_up(world_from_peg(), number)
             if held_up and self.contact_pose is None:
@@ -240,23 +239,26 @@ class Executor:
         if not searching:
             return guarded and pressed
         # What holds it from the side is the walls of the hole.
-        if pressed and not self._landed and not held_up:
+        if pressed and not landed and not held_up:
             return True
         return self.contact_pose is not None and self._sunk(world_from_peg(), number) > plan.sink
 
     def _sunk(self, world_from_peg: Array, number: int) -> float:
         """How far (m) a peg is below its contact with a surface, along the commanded z, at a sample."""
         assert self.contact_pose is not None
-        led = interpolated_command(self.probe, self.probe.stamps[number : number + 1])[0][0]
-        along = Rotation.from_quat(led[[4, 5, 6, 3]]).inv()
+        _, along = self._led(number)
         return float(along.apply(self.contact_pose[:3] - world_from_peg[:3])[2])
 
     def _held_up(self, world_from_peg: Array, number: int) -> bool:
         """Whether the spring presses a peg along the commanded z rather than across it: no wall does so."""
-        led = interpolated_command(self.probe, self.probe.stamps[number : number + 1])[0][0]
-        along = Rotation.from_quat(led[[4, 5, 6, 3]]).inv()
+        led, along = self._led(number)
         spring = along.apply(world_from_peg[:3] - led[:3]) * np.asarray(self.plan.stiffness)[:3]
         return bool(spring[2] > np.linalg.norm(spring[:2]))
+
+    def _led(self, number: int) -> tuple[Array, Rotation]:
+        """The commanded pose (7,) at a sample, and the rotation from the world into its axes."""
+        led = interpolated_command(self.probe, self.probe.stamps[number : number + 1])[0][0]
+        return led, Rotation.from_quat(led[[4, 5, 6, 3]]).inv()
 
     def _found_before(self, motion: int) -> bool:
         """Whether the search that a motion belongs to has found its hole."""

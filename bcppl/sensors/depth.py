@@ -232,7 +232,7 @@ def _depth(where: str, depth: Array, camera: Camera) -> Iterator[str]:
 
 
 def _camera(what: str, camera: Camera, image: DepthImage, recording: Recording) -> Iterator[str]:
-    if camera.width != int(camera.width) or camera.height != int(camera.height):
+    if not all(isinstance(side, int | np.integer) for side in (camera.width, camera.height)):
         yield f"{what} is {camera.width} by {camera.height} pixels; give whole numbers."
     elif camera.width < 1 or camera.height < 1 or not (camera.fx > 0 and camera.fy > 0):
         yield f"{what} has no pixels or no focal length; give its width, height, fx and fy in pixels."

@@ -297,7 +297,7 @@ class Filter:
             with self._changed:
                 late = bool(self._updates) and self._updates[-1].seconds > self.deadline
                 taken = self._waiting.take(join=late)
-                self._under_way = 0 if taken is None else taken[2]
+                self._under_way = 0 if taken is None else taken.joined
             if taken is None:
                 return
             try:

@@ -146,5 +146,5 @@ def test_points_in_single_precision_and_poses_of_another_length() -> None:
     points = np.random.default_rng(0).normal(size=(20, 3)).astype(np.float32)
     belief = Belief(around, torch.zeros(3, dtype=torch.float64))
     assert belief.add(points, around[0].numpy()).abs().max() == 0.0
-    with pytest.raises(InputError, match="pose 0 of a belief has a quaternion of length 2;"):
+    with pytest.raises(InputError, match="a pose of a belief has a quaternion of length 2;"):
         Belief(2.0 * around, torch.zeros(3, dtype=torch.float64))

@@ -27,8 +27,8 @@ from bcppl.inference.filters import guided_smc, tempered_smc
 from bcppl.inference.planning.candidate_layout import plan_candidates
 from bcppl.models import look_and_touch
 from bcppl.models.peg_in_hole import model
-from bcppl.poses import identity, local, retract
-from bcppl.recordings import Measurement, Push, Recording, View, describe, load, problems, save
+from bcppl.poses import as_pose, identity, local, retract, rotation_matrix
+from bcppl.recordings import DepthImage, Measurement, Push, Recording, View, describe, load, problems, save
 from bcppl.recordings.action_file import load_actions, save_actions
 from bcppl.recordings.fingerprint import fingerprint
 from bcppl.robot.plan import Plan
@@ -302,3 +302,60 @@ def test_a_new_kind_is_ranked_and_laid_out_beside_others(laser: Any) -> None:
     *_, last = guided_smc.infer(look_and_touch.model, seen, particles=20, seed=1)
     scene = look_and_touch.prepare(with_candidates(seen, found))
     assert len(by_linearised_gain("part", outer_samples=4, seed=0)(last.population, found, scene)) == 6
+
+
+def test_a_part_that_turns_about_a_frame_far_away_stays_in_the_region_of_its_image() -> None:
+    """A bar whose middle is 60 mm from its frame, its yaw open: turned, it is on the other side."""
+    bar = block((0.04, 0.02, 0.01)).moved(np.array([0.06, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]))
+    eye = looking_at(np.array([0.0, 0.0, 0.5]), np.zeros(3), (0.0, 1.0, 0.0))
+    above = replace(camera("above"), width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5)
+    above = replace(above, world_from_camera=eye)
+    view = Measurement(View(above), DepthImage(np.full((120, 160), 0.5)))
+    guess = Guess(identity(1)[0].numpy(), np.full(3, 0.002), yaw=np.pi)
+    scene = look_and_touch.model.prepare(Recording(bar, guess, [view]))
+    left, top, width, height = scene.likelihoods["view"].looks["above"].region
+    turned = bar.vertices * [-1.0, -1.0, 1.0]
+    pixel = above.project((turned - eye[:3]) @ rotation_matrix(as_pose(eye)).numpy())
+    assert (pixel >= np.array([left, top]) - 0.5).all()
+    assert (pixel <= np.array([left + width, top + height]) - 0.5).all()
+
+
+def test_a_beam_does_not_meet_what_is_beyond_its_range(laser: Any) -> None:
+    down = looking_at(np.array([0.0, 0.0, 0.8]), np.zeros(3), (0.0, 1.0, 0.0))
+    for far, expected in ((1.0, 0.8), (0.5, 0.5)):
+        beam = laser.Beam("down", 0.05, far, down)
+        distance, gradient = laser.BeamDistance(block((0.1, 0.1, 0.05)), identity(2), beam).cast()
+        assert distance.tolist() == pytest.approx([expected] * 2)
+        assert bool((gradient != 0.0).any()) == (far > 0.8)
+
+
+def test_views_that_may_come_next_are_of_the_same_instrument() -> None:
+    sensor: Any = sensor_named("view")
+    (near,) = sensor.around(
+        np.array([0.0, 0, 0, 1, 0, 0, 0]), block((0.1, 0.1, 0.05)), View(camera("c")), 1, 0
+    )
+    assert near.camera.instrument == "c" != near.camera.name
+
+
+@pytest.mark.parametrize(
+    ("background", "words"),
+    [
+        (
+            np.full((6, 8), 700.0),
+            "background of camera 'left': the median depth is 700, probably millimetres",
+        ),
+        (np.full((6, 8), -1.0), "48 depths are negative"),
+        ([[0.5] * 8] * 6, "background of camera 'left' is of type list"),
+    ],
+)
+def test_a_background_is_checked_as_an_image_is(background: Any, words: str) -> None:
+    assert any(words in problem for problem in problems(replace(full(), background={"left": background})))
+
+
+def test_a_width_that_is_no_whole_number_is_refused() -> None:
+    recording = full()
+    view = next(m for m in recording.measurements if isinstance(m.action, View))
+    odd = replace(view, action=View(replace(view.action.camera, name="odd", width=8.0)))
+    assert any(
+        "give whole numbers" in problem for problem in problems(replace(recording, measurements=[odd]))
+    )
