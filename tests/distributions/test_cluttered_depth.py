@@ -127,6 +127,11 @@ def test_missing_pixels_are_skipped_and_nothing_of_them_is_read() -> None:
     assert torch.isfinite(said[0]).all() and float(said[0][0]) > float(said[0][1])
     nothing = ClutteredDepth(RENDERER, lens, poses, SCALE).log_prob(torch.full_like(image, math.nan))
     assert nothing.tolist() == [0.0, 0.0]
+    # Of the same image, which was read without a region first.
+    whole = ClutteredDepth(RENDERER, lens, poses, SCALE).log_prob(image)
+    masked = ClutteredDepth(RENDERER, lens, poses, SCALE, region=~holes).log_prob(image)
+    torch.testing.assert_close(masked, said[0], rtol=0.0, atol=0.0)
+    assert not torch.equal(masked, whole)
 
 
 def test_an_image_for_each_particle_an_image_written_to_and_a_temperature() -> None:

@@ -8,7 +8,6 @@ from dataclasses import KW_ONLY, dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from scipy.ndimage import binary_erosion
 from scipy.special import betainc
@@ -29,7 +28,6 @@ _BEHIND = 3.0  # scales: farther behind the part, a pixel sees through it
 class _Scanned(NamedTuple):
     """The densities of an image's lines without a part, and the inputs that they were computed from."""
 
-    image: Array
     chain: Chain
     spacing: int
     depth: Array
@@ -71,7 +69,7 @@ class ClutteredDepth(CameraImage):
 
     Args:
         renderer: renders one part.
-        camera: takes the image; pixels out of its range are missing.
+        camera: takes the image; pixels out of its range, and out of a `region`, are missing.
         pose: (N, 7) `world_from_part`.
         scale: of the Laplace error of a pixel that shows the part, metres.
         lines: every so many rows and columns are evaluated; neighbouring ones are nearly copies.
@@ -122,6 +120,8 @@ class ClutteredDepth(CameraImage):
         """
         crossings = np.zeros(tuple(self.event_shape), dtype=bool)
         crossings[self.lines // 2 :: self.lines, self.lines // 2 :: self.lines] = True
+        if self.region is not None:
+            crossings &= np.asarray(self.region, dtype=bool)
         alone = RobustDepth(self.renderer, self.camera, self.pose, self.scale, outlier=0.05, region=crossings)
         return alone.observed(value)
 
@@ -134,9 +134,7 @@ class ClutteredDepth(CameraImage):
         correlation of the errors leaves along both directions.
         """
         hits = self.renderer.hits(self.camera, self.pose.detach())
-        depth = value.detach().numpy().reshape(-1).astype(np.float64)
-        with np.errstate(invalid="ignore"):
-            valid = (depth > 0.0) & (depth >= self.camera.near) & (depth <= self.camera.far)
+        depth, valid = self._read(value)
         rate = self.through + 0.5 * math.exp(-_BEHIND)
         probability, excess = np.ones(len(self.pose)), np.zeros(len(self.pose))
         for k in range(len(self.pose)):
@@ -153,6 +151,15 @@ class ClutteredDepth(CameraImage):
                 probability[k] = betainc(seen, count - seen + 1.0, rate)
                 excess[k] = (seen - count * rate) / math.sqrt(count * rate * (1.0 - rate))
         return Check(float(probability.mean()), "through", float(excess.mean()))
+
+    def _read(self, value: Tensor) -> tuple[Array, Mask]:
+        """The depth (H * W,) of an image (H, W), and which of its pixels are in range and may count."""
+        depth = value.detach().numpy().reshape(-1).astype(np.float64)
+        with np.errstate(invalid="ignore"):
+            valid = (depth > 0.0) & (depth >= self.camera.near) & (depth <= self.camera.far)
+        if self.region is not None:
+            valid &= np.asarray(self.region, dtype=bool).reshape(-1)
+        return depth, valid
 
     def _of_lines(self, value: Tensor) -> tuple[Tensor, Tensor]:
         """Log-densities (N,) of the rows and of the columns.
@@ -194,25 +201,22 @@ class ClutteredDepth(CameraImage):
 
     def _scanned(self, value: Tensor) -> _Scanned:
         """The densities of an image (H, W) without a part; cached with it for as long as it is unchanged."""
-        image = value.detach().numpy()
+        depth, valid = self._read(value)
         cached: _Scanned | None = CACHE.get(value)
         if (
             cached is not None
             and (cached.chain, cached.spacing) == (self.chain, self.lines)
-            and np.array_equal(cached.image, image, equal_nan=True)
+            and np.array_equal(cached.depth, depth, equal_nan=True)
+            and np.array_equal(cached.valid, valid)
         ):
             return cached
         height, width = self.event_shape
-        depth = np.array(image, dtype=np.float64).reshape(-1)
-        with np.errstate(invalid="ignore"):
-            valid = (depth > 0.0) & (depth >= self.camera.near) & (depth <= self.camera.far)
         across = [Line(v * width, 1, width) for v in range(self.lines // 2, height, self.lines)]
         down = [Line(u, width, height) for u in range(self.lines // 2, width, self.lines)]
         rows, columns = (Lines(np.full(depth.shape, np.nan), np.full(depth.shape, np.nan)) for _ in range(2))
         of_rows = math.fsum(scan(depth, valid, line, self.chain, rows) for line in across)
         of_columns = math.fsum(scan(depth, valid, line, self.chain, columns) for line in down)
-        copy: npt.NDArray[Any] = np.array(image)
-        scanned = _Scanned(copy, self.chain, self.lines, depth, valid, rows, columns, of_rows, of_columns)
+        scanned = _Scanned(self.chain, self.lines, depth, valid, rows, columns, of_rows, of_columns)
         CACHE[value] = scanned
         return scanned
 

@@ -51,7 +51,7 @@ class FilteredEpisodes(PredictedEpisodes):
     blur: float = field(default=0.0, metadata=NONNEGATIVE)
     bench: LinearErrors = field(default_factory=LinearErrors)
     hypotheses: tuple[Hypothesis, ...] = ()
-    memory: dict[bytes, Linearised] = field(default_factory=dict)
+    memory: dict[bytes, Linearised] = field(default_factory=dict, init=False)
     solids: MeasuresWitness | None = None
 
     def __post_init__(self) -> None:

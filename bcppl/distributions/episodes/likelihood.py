@@ -85,9 +85,11 @@ class ContactEpisodes(FilteredEpisodes):
         blur: m by which the errors of rows are taken to be wider.
         bench: errors that all touches share.
         hypotheses: of compliance, noise and scale; by default the nodes of the compliance.
-        memory: of what is known after which rows, at these poses; where windows share one, each row is used
-            once.
         solids: what measures the gap of pegs that are displaced by shared errors; `gap` unless given.
+
+    Attributes:
+        memory: of what is known after which rows, at these poses and by these arguments; where windows of the
+            same are given that of another, each row is used once.
     """
 
     def log_prob(self, value: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.distributions.episodes.linear_errors import Effect, Jump
 from bcppl.distributions.episodes.rows import SECONDS, WITHIN, WRENCH
-from bcppl.distributions.parameters import NONNEGATIVE, POSITIVE, RARE, check_parameters
+from bcppl.distributions.parameters import NONNEGATIVE, POSITIVE, RARE, check_parameters, within
 
 
 class _Unchanging:
@@ -51,7 +51,7 @@ class Grasp(_Unchanging):
     Attributes:
         shift, turn, yaw: standard deviations along each of the peg's axes (m), about those across it, and
             about its own (rad): 0 for a round peg, which slips do not turn either.
-        slip, slip_turn: of a slip, m and rad.
+        slip, slip_turn: of a slip, m and rad; about a peg's own axis only where there is a `yaw`.
         slips: the probability of one, at each episode of contact.
     """
 
@@ -64,14 +64,28 @@ class Grasp(_Unchanging):
     name = "the peg's pose in the hand"
 
     @property
-    def _scale(self) -> Tensor:
+    def variances(self) -> Tensor:
+        """(M,) 1, or 0 for what only jumps."""
+        return (self._begins > 0.0).double()
+
+    @property
+    def _begins(self) -> Tensor:
         return torch.tensor([self.shift] * 3 + [self.turn, self.turn, self.yaw], dtype=torch.float64)
+
+    @property
+    def _slips(self) -> Tensor:
+        about = self.slip_turn if self.yaw else 0.0
+        return torch.tensor([self.slip] * 3 + [self.slip_turn] * 2 + [about], dtype=torch.float64)
+
+    @property
+    def _scale(self) -> Tensor:
+        # What is known at first, and slips all the same, is counted in standard deviations of a slip.
+        return torch.where(self._begins > 0.0, self._begins, self._slips)
 
     @property
     def jumps(self) -> Sequence[Jump]:
         """Its sudden changes."""
-        slip = torch.tensor([self.slip] * 3 + [self.slip_turn] * 3, dtype=torch.float64)
-        change = torch.where(self._scale > 0.0, slip / self._scale, 0.0)
+        change = torch.where(self._scale > 0.0, self._slips / self._scale, 0.0)
         return (Jump("the peg slipped in the hand", self.slips, change**2),)
 
     def effect(self, rows: Tensor) -> Effect:
@@ -211,7 +225,7 @@ class Delay(_Unchanging):
             that is 60 ms late under a limit of 45 gave a belief that was sure of a pose 3 mm off.
     """
 
-    longest: float = field(default=SECONDS[-2], metadata=POSITIVE)
+    longest: float = field(default=SECONDS[-2], metadata=within(above=0.0, most=SECONDS[-1]))
     within: float = field(default=0.7, metadata=POSITIVE)
     later: float = field(default=0.05, metadata=RARE)
     name = "the time between wrench and pose"

@@ -188,7 +188,7 @@ class ContactProbe:
         """The likelihood of a window for parts at poses (N, 7), its errors `blur` metres wider."""
         settings = self.settings
         stride = max(1, round(PREDICTED / step_of(window.probe)))
-        return ContactEpisodes(
+        site = ContactEpisodes(
             self.gap if gap is None else gap,
             part,
             capacity(window),
@@ -204,9 +204,11 @@ class ContactProbe:
             blur=blur,
             bench=self.bench,
             hypotheses=self.hypotheses,
-            memory=gap.memory if isinstance(gap, RememberedGaps) else {},
             solids=self.gap,
         )
+        if isinstance(gap, RememberedGaps):
+            site.memory = gap.memory
+        return site
 
     def observed(self, measurements: Sequence[Numbered]) -> Mapping[str, Tensor]:
         """The rows by address, those of all earlier windows given; each probe's wrench is tared whole."""
