@@ -10,7 +10,9 @@ import torch
 from torch import Tensor
 
 from bcppl.distributions.episodes import Grasp, LinearErrors, PartSlides
+from bcppl.distributions.episodes.filter.branches import KEPT
 from bcppl.distributions.episodes.linear_errors import Effect
+from bcppl.distributions.episodes.prior import nodes_of
 from bcppl.distributions.episodes.rows import FORCE
 from bcppl.distributions.manifold import FARTHEST
 from tests.distributions.touches.test_linear_errors import dense, rows_with_wrenches, site
@@ -51,8 +53,7 @@ def test_a_slip_is_one_of_the_sums_over_when_it_was() -> None:
 def test_evidence_sums_over_all_that_may_have_happened_at_each_touch(case: str) -> None:
     """Nothing, a slip, a slide or both, in a touch that is an outlier or not, enumerated."""
     pose = around(3, 0, 1e-5, 1e-4)
-    rows = rows_with_wrenches([1] * 6, [0, 0, 1, 1, 2, 2], seed=5)
-    rows[:, :3], rows[:, 3:7] = 0.0, torch.tensor([1.0, 0, 0, 0])
+    rows = as_expected()
     if case.startswith("slips"):
         rows[2:, 2] -= 2e-3
     else:
@@ -81,6 +82,40 @@ def test_evidence_sums_over_all_that_may_have_happened_at_each_touch(case: str) 
     said = site(pose, rows, *errors.errors, outlier=outlier).log_prob(rows)
     torch.testing.assert_close(said, expected, rtol=0.0, atol=0.2)  # touches that do not surprise are spared
     assert float((expected - torch.logsumexp(torch.stack(apart), dim=0)).min()) > 0.5
+
+
+def test_a_touch_that_does_not_surprise_is_charged_that_nothing_slipped() -> None:
+    """Three touches where they should be: all that may have slipped, enumerated, and nothing alone."""
+    pose, rows = around(4, 0, 1e-5, 1e-4), as_expected()
+    grasp = Grasp(1e-4, 1e-3, 1e-3, slip=5e-4, slip_turn=1e-3, slips=0.05)
+    errors = LinearErrors((grasp,))
+    each = []
+    for happened in itertools.product((False, True), repeat=3):
+        extra = torch.zeros(6, 6, len(errors.means), dtype=torch.float64)
+        for touch, slips in enumerate(happened):
+            share = slipped_by(rows, 2 * touch)
+            extra += slips * torch.minimum(share[:, None], share)[..., None] * errors.jumps[0].variances
+        each.append(dense(pose, rows, errors, extra) + sum(math.log(0.05 if s else 0.95) for s in happened))
+    expected = torch.logsumexp(torch.stack(each), dim=0)
+    torch.testing.assert_close(site(pose, rows, grasp).log_prob(rows), expected, rtol=0.0, atol=0.02)
+
+
+def test_hypotheses_that_are_dropped_leave_their_weight_to_the_others() -> None:
+    """Evidence of the many hypotheses of a bench whose peg may slip is the sum over each alone."""
+    pose, rows = around(4, 0, 1e-5, 1e-4), as_expected()
+    grasp, every = Grasp(1e-4, 1e-3, 1e-3, slip=5e-4, slip_turn=1e-3, slips=0.05), nodes_of(5e-6, 0.5)
+    together = site(pose, rows, grasp, hypotheses=every)
+    alone = [each.log_weight + site(pose, rows, grasp, hypotheses=(each,)).log_prob(rows) for each in every]
+    assert len(every) > KEPT >= together.branches(rows).number.max()
+    expected = torch.logsumexp(torch.stack(alone), dim=0)
+    torch.testing.assert_close(together.log_prob(rows), expected, rtol=0.0, atol=0.02)
+
+
+def as_expected() -> Tensor:
+    """Rows of three touches of two rows each, with the peg where it should be."""
+    rows = rows_with_wrenches([1] * 6, [0, 0, 1, 1, 2, 2], seed=5)
+    rows[:, :3], rows[:, 3:7] = 0.0, torch.tensor([1.0, 0, 0, 0])
+    return rows
 
 
 class Tilt(PartSlides):

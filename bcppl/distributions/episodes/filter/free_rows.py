@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from bcppl.arrays import Array
 from bcppl.compiled import compiled
 
 # Standard deviations by which the gap of a peg between two walls seems less: it is the least of two that err
@@ -32,6 +33,13 @@ def log_sum(a: float, b: float) -> float:
     """The logarithm of the sum of two numbers given by theirs."""
     high, low = max(a, b), min(a, b)
     return high + math.log1p(math.exp(low - high)) if low > -np.inf else high
+
+
+@compiled
+def log_total(each: Array) -> float:
+    """The logarithm of the sum of numbers given by theirs, one of them finite."""
+    high = each.max()
+    return float(high + math.log(np.exp(each - high).sum()))
 
 
 @compiled

@@ -9,8 +9,8 @@ or of an outlier, where a piece surprises. A change is a Wiener process that run
 more than it was: what is held by friction slips then, at once or slowly, and not under a steady force.
 Hypotheses multiply there, and the most probable ones are kept (a Gaussian mixture filter: Alspach and
 Sorenson, Nonlinear Bayesian estimation using Gaussian sum approximations, IEEE TAC 17, 1972). Each row's
-probability is conditional on those before it, so the product is a density of all rows, whatever was dropped,
-but for the share of what was.
+probability is conditional on those before it, and those that are kept take the weight of all, so that the
+product is a density of all rows; what may change in a piece that does not surprise is left out of it.
 
 A row without contact has the probability that its gap is positive, or about zero where the peg rubs along
 the part, and the parameters the first two moments given that (assumed density filtering).
@@ -52,6 +52,7 @@ from bcppl.distributions.episodes.filter.free_rows import (
     RUBBING,
     log_free,
     log_sum,
+    log_total,
 )
 from bcppl.distributions.episodes.filter.gaps import Gaps, line
 from bcppl.threads import parallel_sum, thread_count
@@ -256,13 +257,13 @@ def _filter(
                                 later[a, c] = within + spread
                         found += 1
                         break
+                    chance = prior.change_log_probability[change] if segments.slips[s] else 0.0
                     surprise = square[found] - rows > _SURPRISING * math.sqrt(2.0 * rows) + 1.0
                     if change == 0 and not surprise:
                         # Nothing differs between the two but a state that is hardly ever the outlier's.
-                        weight[found] = log_sum(inlier, outlier)
+                        weight[found] = log_sum(inlier, outlier) + chance
                         found += 1
                         break
-                    chance = prior.change_log_probability[change] if segments.slips[s] else 0.0
                     weight[found], weight[found + 1] = inlier + chance, outlier + chance
                     square[found + 1] = square[found]
                     found += 2
@@ -319,4 +320,7 @@ def _filter(
                 event[n, left], squared[n, left] = old_event[b], old_squared[b]
                 event[n, left, episode], squared[n, left, episode] = kind[c], square[c]
                 left += 1
+            if crowded:
+                # What is kept stands for what is not.
+                log_weight[n, :left] += log_total(weight[:found]) - log_total(log_weight[n, :left])
             number[n], episode = left, episode + 1
