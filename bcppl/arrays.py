@@ -80,6 +80,14 @@ class ArrayRecord:
         return type(self)(**values)
 
 
+def as_array(values: Any) -> Any:
+    """Numbers in lists as an array; anything else as it is, for a check to name."""
+    try:
+        return np.asarray(values, dtype=np.float64) if isinstance(values, (list, tuple)) else values
+    except (TypeError, ValueError):
+        return values
+
+
 def _alike(name: str, mine: Any, named: Mapping[str, npt.NDArray[Any]]) -> Any:
     theirs = named.get(name)
     axes = [axis for axis in range(mine.ndim) if axis != 1 or mine.shape[1]]

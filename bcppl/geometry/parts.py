@@ -14,7 +14,7 @@ import numpy as np
 
 from bcppl import poses
 from bcppl.arguments import number_within
-from bcppl.arrays import Array, Indices
+from bcppl.arrays import Array, Indices, as_array
 from bcppl.errors import InputError
 from bcppl.geometry.mesh_file import read_mesh
 
@@ -256,6 +256,10 @@ class Guess:
     tilt: float = 0.0
     yaw: float = 0.0
     angle: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("world_from_part", "translation"):
+            object.__setattr__(self, name, as_array(getattr(self, name)))
 
     def farthest(self, point: Array) -> float:
         """How far (m) a point (3,) of the part may be from where it is at the guess, within the bounds."""

@@ -73,14 +73,17 @@ def is_known(stream: Stream, stamps: Array, longest: float | None) -> Mask:
 def values_at(stream: Stream, stamps: Array) -> Array:
     """Values (T, C) at even stamps, of a fast stream the mean over the time from one stamp to the next.
 
-    The mean is centred at the stamp, and that of the straight lines between rows: it is right at any rate.
+    The mean is centred at the stamp, at the stream's ends over less time, and that of the straight lines
+    between rows: it is right at any rate.
     """
     step = float(stamps[1] - stamps[0]) if len(stamps) > 1 else stream.step
     if step < FAST * stream.step:
         columns = [np.interp(stamps, stream.times, column) for column in stream.values.T]
         return np.stack(columns, axis=1)
-    low = np.clip(stamps - 0.5 * step, stream.times[0], stream.times[-1])
-    high = np.clip(stamps + 0.5 * step, stream.times[0], stream.times[-1])
+    inside = np.clip(stamps, stream.times[0], stream.times[-1])
+    left = np.minimum(inside - stream.times[0], stream.times[-1] - inside)
+    half = np.clip(left, 0.01 * stream.step, 0.5 * step)
+    low, high = np.maximum(inside - half, stream.times[0]), np.minimum(inside + half, stream.times[-1])
     means = [_integral(stream.times, c, high) - _integral(stream.times, c, low) for c in stream.values.T]
     return np.stack(means, axis=1) / (high - low)[:, None]
 

@@ -15,7 +15,7 @@ from bcppl.rendering.region_of_interest import UnseenError, region_of_interest
 # Steps of the differences; with smaller ones a ray's jumps from face to face dominate.
 STEPS = (5e-4, 5e-4, 5e-4, 5e-3, 5e-3, 5e-3)
 JUMP = 0.01  # m: a pixel that changes by more goes from the part to its background, and is an outlier
-WITHIN = 0.01  # m: margin of the rendered region around the mean pose
+WITHIN = 0.01  # m: margin of the rendered region around where the part is by any pose
 
 
 def pixel_information(renderer: PartRenderer, camera: Camera, part: Tensor, bins: int = 1) -> Tensor:
@@ -26,10 +26,10 @@ def pixel_information(renderer: PartRenderer, camera: Camera, part: Tensor, bins
     left out: the sum is zero where no pixel shows the part. With `bins` one pixel stands for a square of so
     many.
     """
-    middle = part[0].numpy()
-    spread = float((part[:, :3] - part[0, :3]).norm(dim=1).max())
+    middles = poses.transform(part, torch.as_tensor(renderer.part.middle)[None])
+    spread = float((middles - middles[0]).norm(dim=-1).max())
     try:
-        region = region_of_interest(camera, renderer.part, middle, WITHIN + spread, bins)
+        region = region_of_interest(camera, renderer.part, part[0].numpy(), WITHIN + spread, bins)
     except UnseenError:
         return torch.zeros(len(part), 7, 7, dtype=torch.float64)
     near = camera.cropped(*region).binned(bins)

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bcppl import poses
-from bcppl.arrays import Array
+from bcppl.arrays import Array, as_array
 from bcppl.errors import InputError
 from bcppl.geometry.camera import OPTICAL, Camera, looking_at
 from bcppl.geometry.distortion import coefficients
@@ -44,6 +44,9 @@ class DepthImage:
 
     depth: Array
     rgb: npt.NDArray[np.uint8] | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "depth", as_array(self.depth))
 
     def __repr__(self) -> str:
         depth = np.asarray(self.depth)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -16,6 +16,7 @@ from torch.distributions import Normal
 from bcppl.arrays import Array
 from bcppl.distributions.lazy import LazyDistribution
 from bcppl.distributions.manifold import Quadratic
+from bcppl.errors import InputError
 from bcppl.geometry.camera import looking_at
 from bcppl.geometry.parts import Part
 from bcppl.poses import as_pose, compose, inverse, rotation_matrix
@@ -89,16 +90,34 @@ class BeamDistance(LazyDistribution):
         return Quadratic(weight * error[:, None] * rows, information)
 
 
+def _stated_beam(**fields: Any) -> Beam:
+    """A beam that somebody wrote down, which is refused where it is none."""
+    beam = Beam(**fields)
+    for problem in _problems(f"laser {beam.name!r}", beam):
+        raise InputError(problem)
+    return beam
+
+
+def _problems(what: str, beam: Beam) -> Iterator[str]:
+    yield from checks.pose(f"{what}: its world_from_laser", beam.world_from_laser)
+    if not 0 <= beam.near < beam.far < math.inf:
+        yield (
+            f"{what} reaches from {beam.near:g} to {beam.far:g} m; give a finite range, near below far, in "
+            "metres."
+        )
+
+
 class WristLaser(PlannedAsIs):
     """Distances along beams."""
 
     kind = candidate_kind = "laser"
     names = ("laser distance", "laser distances")
     contact = False
-    action = candidate = Layout(
+    action = Layout(
         Beam,
         {"name": TEXT, "near": number("m"), "far": number("m"), "world_from_laser": numbers(POSE_UNITS)},
     )
+    candidate = replace(action, make=_stated_beam)
     observation = Layout(Distance, {"metres": number("m")})
     caption = "the beam as far as it reaches"
 
@@ -110,12 +129,9 @@ class WristLaser(PlannedAsIs):
     def problems(self, measurements: Indexed, recording: Recording) -> Iterator[tuple[int, str]]:
         """Problems of beams and distances."""
         for k, (beam, metres) in ((k, (m.action, m.observation.metres)) for k, m in measurements):
-            for problem in checks.pose(f"measurement {k}'s world_from_laser", beam.world_from_laser):
-                yield k, problem
-            if not 0 <= beam.near < beam.far < math.inf:
-                reach = f"measurement {k}: laser {beam.name!r} reaches from {beam.near:g} to {beam.far:g} m"
-                yield k, f"{reach}; give a finite range, near below far, in metres."
-            elif not beam.near <= metres <= beam.far:
+            wrong = list(_problems(f"measurement {k}: laser {beam.name!r}", beam))
+            yield from ((k, problem) for problem in wrong)
+            if not wrong and not beam.near <= metres <= beam.far:
                 yield k, f"measurement {k}: a distance of {metres:.4g} m is out of range; leave it out."
 
     def describe(self, measurements: Sequence[Measurement], recording: Recording) -> list[tuple[str, str]]:

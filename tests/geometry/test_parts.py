@@ -28,6 +28,13 @@ def part(*bodies: Any, turned: int = 0) -> Part:
     return Part("boxes", np.asarray(whole.vertices), faces)
 
 
+def test_numbers_in_lists_are_a_guess_and_what_is_no_number_stays_for_the_check() -> None:
+    guess = Guess([0, 0, 0.1, 1, 0, 0, 0], (0.01, 0.01, 0), tilt=0.1)
+    assert guess.world_from_part.dtype == guess.translation.dtype == np.float64
+    assert guess.farthest(np.zeros(3)) == pytest.approx(0.01 * 2.0**0.5)
+    assert Guess(["here"], [0, 0, 0]).world_from_part == ["here"]
+
+
 def test_solids_are_accepted() -> None:
     for bodies in (
         [box(0.1)],

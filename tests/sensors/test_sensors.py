@@ -131,7 +131,7 @@ def test_problems_of_a_new_kind_stand_where_its_measurements_do(laser: Any) -> N
     starts = [
         "measurement 8: a distance of 0.9 m",
         "measurement 10: the depth",
-        "measurement 11's world_from_laser",
+        "measurement 11: laser 'wrist': its world_from_laser",
     ]
     for problem, start in zip(wrong, starts, strict=True):
         assert problem.startswith(start)
@@ -179,6 +179,19 @@ def test_candidates_of_a_new_kind_come_back_from_files(laser: Any, suffix: str, 
     back = load_actions(tmp_path / f"next{suffix}")
     assert_identical(back[0], aim)
     assert isinstance(back[1], View)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "named"),
+    [({"near": 0.6}, "below far"), ({"world_from_laser": 2.0 * ABOVE}, "its world_from_laser")],
+)
+def test_a_beam_that_is_none_is_refused_where_it_is_read(
+    laser: Any, wrong: Any, named: str, tmp_path: Path
+) -> None:
+    save_actions([replace(laser.Beam("spot", 0.05, 0.5, ABOVE), **wrong)], tmp_path / "next.json")
+    with pytest.raises(InputError, match=f"action 0 of .*laser 'spot'.*{named}") as caught:
+        load_actions(tmp_path / "next.json")
+    assert_one_sentence(str(caught.value).replace(str(tmp_path), ""))
 
 
 def test_a_candidate_of_a_new_kind_is_drawn(laser: Any) -> None:

@@ -48,7 +48,7 @@ class Fit(NamedTuple):
 
 
 def thinned(camera: Camera, depth: Array) -> Seen:
-    """The image at every so manyth pixel, with depths of 0 missing."""
+    """The image at every nth pixel, so that about `WIDE` are left of a row, with depths of 0 missing."""
     step = max(1, round(camera.width / WIDE))
     values = np.array(depth[::step, ::step], dtype=float)
     values[values == 0.0] = np.nan

@@ -46,6 +46,16 @@ def test_of_a_plane_that_fills_the_image_it_is_the_closed_form() -> None:
     torch.testing.assert_close(information[0], information[1])
 
 
+def test_what_pixels_tell_of_one_particle_does_not_depend_on_the_others() -> None:
+    """A part far off its origin swings out of the first particle's region where another turns it."""
+    away = torch.tensor([0.08, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
+    renderer, camera = RayCaster(block((0.03, 0.03, 0.02)).moved(away.numpy())), from_above(0.3)
+    turned = poses.retract(poses.identity(1), torch.tensor([[0, 0, 0, 0, 0, 0.8]], dtype=torch.float64))
+    together = pixel_information(renderer, camera, torch.cat([poses.identity(1), turned]))
+    assert float(together[1, 2, 2]) > 50.0
+    torch.testing.assert_close(together[1:], pixel_information(renderer, camera, turned))
+
+
 def test_surfaces_out_of_the_sensors_range_are_uninformative() -> None:
     renderer = RayCaster(block((0.3, 0.3, 0.02)))
     seen = pixel_information(renderer, from_above(0.3), poses.identity(1))

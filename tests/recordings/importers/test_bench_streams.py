@@ -89,6 +89,13 @@ def test_a_line_is_a_line_at_any_rate(rate: float) -> None:
     assert is_known(stream, inside, None).all()
 
 
+def test_a_fast_stream_is_right_at_its_ends_too() -> None:
+    times = np.arange(2001) / 2000.0
+    stamps = np.arange(101) / 100.0
+    line = values_at(Stream("pose", times, np.stack([times, -3.0 * times], axis=1)), stamps)
+    np.testing.assert_allclose(line, np.stack([stamps, -3.0 * stamps], axis=1), atol=1e-5)
+
+
 def test_a_fast_streams_noise_is_averaged() -> None:
     rng = np.random.default_rng(0)
     stream = Stream("wrench", np.arange(20_000) / 2000.0, rng.normal(size=(20_000, 1)))
