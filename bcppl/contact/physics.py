@@ -121,10 +121,16 @@ class _Particles(ArrayRecord):
 
 
 class Rollout:
-    """One probe simulated for N poses of the part, as far as it was asked for; indexing copies."""
+    """One probe simulated for N poses of the part, as far as it was asked for; indexing copies.
 
-    def __init__(self, simulation: ProbeSimulation, particles: _Particles) -> None:
-        self.simulation, self._particles = simulation, particles
+    Many rollouts are copies of few where moves are screened, and most of them are never asked for anything:
+    they are made when the first is.
+    """
+
+    def __init__(
+        self, simulation: ProbeSimulation, particles: _Particles, copies: Indices | None = None
+    ) -> None:
+        self.simulation, self._kept, self._copies = simulation, particles, copies
 
     @classmethod
     def at_rest(
@@ -136,13 +142,19 @@ class Rollout:
         rows, state = np.empty((count, 0, SENSOR_COLUMNS)), simulation.steppers[0].at_rest(count)
         return cls(simulation, _Particles(world_from_part, nuisances, rows, state, free, level))
 
+    @property
+    def _particles(self) -> _Particles:
+        if self._copies is not None:
+            self._kept, self._copies = self._kept[self._copies], None
+        return self._kept
+
     def __len__(self) -> int:
-        return len(self._particles.world_from_part)
+        return len(self._kept.world_from_part if self._copies is None else self._copies)
 
     @property
     def count(self) -> int:
         """The number of stamps that have been simulated."""
-        return int(self._particles.rows.shape[1])
+        return int(self._kept.rows.shape[1])
 
     @property
     def nuisances(self) -> Mapping[str, Array]:
@@ -192,7 +204,11 @@ class Rollout:
 
     def __getitem__(self, index: Selection) -> Rollout:
         """Rollouts of some particles, in the order of an index tensor, a mask or a slice."""
-        return Rollout(self.simulation, self._particles[rows_of(index)])
+        every = np.arange(len(self)) if self._copies is None else self._copies
+        rows = every[rows_of(index)]
+        if len(rows) > len(self._kept.world_from_part):
+            return Rollout(self.simulation, self._kept, rows)
+        return Rollout(self.simulation, self._kept[rows])
 
     def where(self, mask: Selection, other: Rollout) -> Rollout:
         """This rollout's particles where a mask (N,) is true, the other's elsewhere, both run equally far.
@@ -230,7 +246,7 @@ class Rollout:
         return self
 
     def _update(self, **changes: Any) -> None:
-        self._particles = replace(self._particles, **changes)
+        self._kept = replace(self._particles, **changes)
 
     @property
     def _shares_free_motion(self) -> bool:

@@ -158,6 +158,12 @@ def test_chunks_batches_order_and_shared_free_motion_change_nothing() -> None:
     order = torch.tensor([4, 1, 6, 1])
     same(whole[order], physics.start(poses()[order], SEARCH).advance(120))
     same(whole[order], physics.start(poses(), SEARCH).advance(60)[order].advance(120))
+    copies = torch.arange(7).repeat_interleave(3)
+    many = physics.start(poses(), SEARCH).advance(60)[copies]
+    assert len(many) == 21 and many.count == 60
+    same(whole[order], many[3 * order].advance(120))
+    same(whole[copies][12:15], many[copies == 4].advance(120))
+    same(whole[copies], many.advance(120))
     odd = replace(SEARCH, stamps=np.sort(np.r_[0.0033:1.19:0.0071, 0.6004]))
     one = physics.start(poses(), odd).advance(100)
     two = physics.start(poses(), odd)
