@@ -76,7 +76,7 @@ class Executor:
     Raises:
         InputError: the plan takes less than the eleven samples by which the wrench is tared, does not begin
             with a free motion and has no tare, is sampled faster than the command can be changed, or is
-            faster than a limit.
+            faster than a limit; or the tare is no force.
     """
 
     def __init__(
@@ -106,7 +106,9 @@ class Executor:
         self.contact_pose: Array | None = None
         self.state: State = "moving"
         self.reason = ""
-        self.tare: Array | None = tare
+        self.tare: Array | None = None if tare is None else _force("the tare", tare)
+        if self.tare is not None and not np.isfinite(self.tare).all():
+            raise InputError("the tare is not finite; give what the sensor reads without contact, in N.")
         self._forces: list[Array] = []  # the first ones and the newest ones, N
         self._held: Array | None = None
         self._motion = np.clip(
@@ -133,12 +135,19 @@ class Executor:
     def sample(self, force: Array, world_from_peg: Callable[[], Array]) -> bool:
         """What was measured at the next of the plan's stamps; whether the command has changed by it.
 
+        Where the state is not "moving" any more, nothing changes.
+
         Args:
             force: (3,) N, as the sensor reads it.
             world_from_peg: gives the measured pose (7,), where it is asked for.
+
+        Raises:
+            InputError: the force has another shape.
         """
+        if self.state != "moving":
+            return False
         number, stamps = self.taken, self.probe.stamps
-        self._forces.append(np.asarray(force))
+        self._forces.append(_force("a sample", force))
         of = int(self._motion[number])
         if violation := self._violation():
             self._abort(number, of, violation, world_from_peg)
@@ -198,14 +207,20 @@ class Executor:
         # Corners are rounded: the end of a free motion is led at the beginning of the next.
         free = np.convolve(free, np.ones(ROUNDED + 1))[: len(free)]
         limit = np.where(free > 0.0, self.limits.free_speed, self.limits.speed)
-        speed = np.linalg.norm(np.diff(path[:, :3], axis=0), axis=1) / np.diff(times)
-        if not (speed > limit * (1.0 + ROUNDING)).any():
-            return ""
-        worst = int((speed / limit).argmax())
-        return (
-            f"it was stopped early, and what follows would be led at {1e3 * speed[worst]:.0f} mm/s, over the "
-            f"limit of {1e3 * limit[worst]:.0f}; go back to where the stroke began, or take more time."
-        )
+        speed, turning = _speeds(times, path)
+        remedy = "go back to where the stroke began, or take more time."
+        if (speed > limit * (1.0 + ROUNDING)).any():
+            worst = int((speed / limit).argmax())
+            return (
+                f"it was stopped early, and what follows would be led at {1e3 * speed[worst]:.0f} mm/s, over "
+                f"the limit of {1e3 * limit[worst]:.0f}; {remedy}"
+            )
+        if (turning > self.limits.turning * (1.0 + ROUNDING)).any():
+            return (
+                f"it was stopped early, and what follows would turn the peg by {turning.max():.2g} rad/s, "
+                f"over the limit of {self.limits.turning:g}; {remedy}"
+            )
+        return ""
 
     def _finish(self) -> None:
         self.state = "finished"
@@ -269,12 +284,24 @@ class Executor:
         return False
 
 
+def _force(what: str, given: Array) -> Array:
+    force = np.asarray(given, dtype=np.float64)
+    if force.shape != (3,):
+        raise InputError(f"{what} of an executor has shape {force.shape}; give the force alone, (3,) in N.")
+    return force
+
+
+def _speeds(times: Array, path: Array) -> tuple[Array, Array]:
+    """m/s and rad/s (K - 1,) between poses (K, 7) at times (K,)."""
+    spans, turns = np.diff(times), Rotation.from_quat(path[:, [4, 5, 6, 3]])
+    speed = np.linalg.norm(np.diff(path[:, :3], axis=0), axis=1) / spans
+    return speed, (turns[:-1].inv() * turns[1:]).magnitude() / spans
+
+
 def _refuse_speed(plan: Plan, limits: Limits) -> None:
     for name, value in limits._asdict().items():
         number_within(f"the arm's limit of {name} is {{}}", value, above=0.0)
-    spans, turns = np.diff(plan.times), Rotation.from_quat(plan.world_from_peg[:, [4, 5, 6, 3]])
-    speeds = np.linalg.norm(np.diff(plan.world_from_peg[:, :3], axis=0), axis=1) / spans
-    turning = (turns[:-1].inv() * turns[1:]).magnitude() / spans
+    speeds, turning = _speeds(plan.times, plan.world_from_peg)
     if (fast := turning > limits.turning * (1.0 + ROUNDING)).any():
         k = int(fast.argmax())
         raise InputError(

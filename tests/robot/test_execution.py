@@ -223,3 +223,38 @@ def test_a_push_that_begins_higher_takes_longer_and_is_no_faster(above: float) -
     led = insertion.push_from(np.array([0.0, 0.0, above, *UPRIGHT]))
     speed = np.linalg.norm(np.diff(led.world_from_peg[:, :3], axis=0), axis=1) / np.diff(led.times)
     assert led.world_from_peg[-1, 2] == pytest.approx(-0.02) and speed.max() == pytest.approx(0.02)
+
+
+def test_what_follows_a_stop_turns_no_faster_than_the_limit() -> None:
+    """Of 0.8 rad in two seconds most is left where the stroke is stopped, for a free motion of 0.2 s."""
+    knots = descent().world_from_peg.copy()
+    for k, yaw in ((2, 0.8), (3, 0.9)):
+        knots[k, 3:] = np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)
+    knots[3, 2] = -0.03
+    plan = descent(world_from_peg=knots)
+    executed(Executor(plan, limits=Limits(turning=0.6)), wall=-1.0)
+    executor = Executor(plan, limits=Limits(turning=0.6))
+    executed(executor, wall=-0.01)
+    assert executor.state == "aborted" and "turn the peg by" in executor.reason
+
+
+def test_after_its_end_an_execution_changes_no_more() -> None:
+    executor = Executor(descent(), limits=Limits(force=20.0))
+    executed(executor, wall=-1.0, hits={60: 50.0, 61: 50.0})
+    held, reason = executor.commanded().copy(), executor.reason
+    for height in np.linspace(-0.02, -0.5, 400):
+        pose = np.array([0.0, 0.0, height, *UPRIGHT])
+        assert not executor.sample(np.array([0.0, 0.0, 100.0]), lambda pose=pose: pose)
+    assert executor.state == "aborted" and executor.reason == reason
+    np.testing.assert_array_equal(executor.commanded(), held)
+
+
+def test_what_is_no_force_is_refused() -> None:
+    for tare, named in ((np.full(3, np.nan), "not finite"), (np.zeros(6), "has shape")):
+        with pytest.raises(InputError, match=named):
+            Executor(descent(), tare=tare)
+    executor = Executor(descent())
+    for force in (np.zeros(6), np.zeros((2, 3)), 5.0):
+        with pytest.raises(InputError, match="the force alone"):
+            executor.sample(np.asarray(force), executor.commanded)
+    assert executor.taken == 0
