@@ -7,7 +7,14 @@ from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
 
 import torch
-from pyro.distributions import MixtureSameFamily, SineBivariateVonMises, SineSkewed, VonMises
+from pyro.distributions import (
+    DirichletMultinomial,
+    MixtureSameFamily,
+    Multinomial,
+    SineBivariateVonMises,
+    SineSkewed,
+    VonMises,
+)
 from pyro.distributions.torch_distribution import ExpandedDistribution, MaskedDistribution
 from torch import Tensor
 from torch.distributions import (
@@ -18,8 +25,10 @@ from torch.distributions import (
     Geometric,
     Independent,
     OneHotCategorical,
+    TransformedDistribution,
     constraints,
 )
+from torch.distributions.constraints import MixtureSameFamilyConstraint
 from torch.distributions.utils import probs_to_logits
 
 from bcppl.distributions.lazy import LazyDistribution
@@ -84,11 +93,26 @@ def is_of_angles(distribution: Any) -> bool:
 
 
 def whole_support(distribution: Any) -> Any:
-    """A distribution's support; of angles one turn, from -pi to pi."""
-    support = distribution.support
+    """A distribution's support; of angles one turn, from -pi to pi, of a mixture that of all components."""
+    support = _of_components(distribution.support)
     if not is_of_angles(distribution):
         return support
     return constraints.independent(TURN, support.event_dim) if support.event_dim else TURN
+
+
+def _of_components(support: Any) -> Any:
+    """Of a mixture's support that of its components, where it is the same for all."""
+    if isinstance(support, constraints.independent):
+        components = _of_components(support.base_constraint)
+        if components is support.base_constraint:
+            return support
+        return constraints.independent(components, support.reinterpreted_batch_ndims)
+    if isinstance(support, MixtureSameFamilyConstraint):
+        components = innermost = _of_components(support.base_constraint)
+        while isinstance(innermost, constraints.independent):
+            innermost = innermost.base_constraint
+        return support if any(isinstance(v, Tensor) for v in vars(innermost).values()) else components
+    return support
 
 
 class Support(NamedTuple):
@@ -131,17 +155,23 @@ def log_prob_inside(distribution: Any, value: Tensor, *, any_turn: bool = True) 
     An observed angle may be given in any turn, a latent one is from -pi to pi: on the line it would have
     infinitely much mass.
 
-    Pyro's densities continue beyond it without validation: an exponential's grows below 0. Pose distributions
-    and lazy ones check their support themselves. NaN is no value, and is passed on.
+    Pyro's densities continue beyond it without validation: an exponential's grows below 0. torch states as
+    the support of a transformed distribution where the last transform may lead, so that of a shifted
+    exponential is the whole line, and as that of a mixture what all components have in common: what is
+    transformed is looked up where it comes from, and a mixture's density is the sum of its components', each
+    inside its own. Pose distributions and lazy ones check their support themselves. NaN is no value, and is
+    passed on.
     """
     value = density_argument(distribution, value)
-    if any_turn if is_of_angles(distribution) else not _is_bounded(distribution):
+    if isinstance(base(distribution), MixtureSameFamily):
+        return _of_mixture(distribution, value, any_turn)
+    if any_turn if is_of_angles(distribution) else not _is_bounded(distribution, any_turn):
         return distribution.log_prob(value)
-    inside = _inside(distribution, value, masked=True)
+    inside = _inside(distribution, value, any_turn, masked=True)
     if not bool(inside.all()):
         inside = inside | _any_entry(torch.isnan(value), len(distribution.event_shape))
     if support_of(distribution).is_discrete:
-        safe = _inside(distribution, value, masked=False)
+        safe = _inside(distribution, value, any_turn, masked=False)
         if not bool(safe.all()):
             # A whole number may be an index: one out of range raises before its density could be masked.
             with torch.random.fork_rng(devices=[]):
@@ -149,6 +179,24 @@ def log_prob_inside(distribution: Any, value: Tensor, *, any_turn: bool = True) 
             safe = safe.reshape(safe.shape + (1,) * len(distribution.event_shape))
             value = torch.where(safe, value, drawn)
     return torch.where(inside, distribution.log_prob(value), -torch.inf)
+
+
+def _of_mixture(distribution: Any, value: Tensor, any_turn: bool) -> Tensor:
+    """`log_prob_inside` of a mixture, in whatever changes its shape or masks it."""
+    if isinstance(distribution, MixtureSameFamily):
+        each = log_prob_inside(
+            distribution.component_distribution, distribution._pad(value), any_turn=any_turn
+        )
+        return torch.logsumexp(each + distribution.mixture_distribution.logits.log_softmax(dim=-1), dim=-1)
+    log_prob = _of_mixture(distribution.base_dist, value, any_turn)
+    if isinstance(distribution, MaskedDistribution):
+        kept = torch.as_tensor(distribution._mask, device=value.device)
+        return torch.where(kept, log_prob, torch.zeros_like(log_prob))
+    if isinstance(distribution, Independent):
+        summed = distribution.reinterpreted_batch_ndims
+        return log_prob.flatten(-summed).sum(dim=-1) if summed else log_prob
+    batch = value.shape[: value.ndim - len(distribution.event_shape)]
+    return log_prob.expand(torch.broadcast_shapes(distribution.batch_shape, batch))
 
 
 def density_argument(distribution: Any, value: Tensor) -> Tensor:
@@ -198,13 +246,15 @@ def _stated(distribution: Any, rounded: Tensor, *, is_binary: bool) -> Tensor:
     return rounded & (distribution.logits == probs_to_logits(distribution.probs, is_binary=is_binary))
 
 
-def _is_bounded(distribution: Any) -> bool:
+def _is_bounded(distribution: Any, any_turn: bool) -> bool:
     """Whether a value may lie outside the support, and the log-probability does not check it."""
     if getattr(type(distribution), "support", None) in (constraints.real, constraints.real_vector):
         return False
     innermost = base(distribution)
     if isinstance(innermost, LazyDistribution) or freedom_of(innermost) is not None:
         return False
+    if _comes_from_within(innermost, any_turn):
+        return True
     try:
         support = support_of(innermost)
     except NotImplementedError:
@@ -215,18 +265,33 @@ def _is_bounded(distribution: Any) -> bool:
     )
 
 
-def _inside(distribution: Any, value: Tensor, masked: bool) -> Tensor:
+def _comes_from_within(distribution: Any, any_turn: bool) -> bool:
+    """Whether it is transformed of values within bounds, and states as its support where any would lead."""
+    if getattr(type(distribution), "support", None) is not TransformedDistribution.support:
+        return False
+    within = distribution.base_dist
+    return not any_turn if is_of_angles(within) else _is_bounded(within, any_turn)
+
+
+def _inside(distribution: Any, value: Tensor, any_turn: bool, masked: bool) -> Tensor:
     """Whether values lie in the support, over the batch; a masked entry counts as inside if `masked`."""
     if isinstance(distribution, MaskedDistribution):
-        inside = _inside(distribution.base_dist, value, masked)
+        inside = _inside(distribution.base_dist, value, any_turn, masked)
         return inside | ~torch.as_tensor(distribution._mask, device=value.device) if masked else inside
     if isinstance(distribution, Independent):
-        inside = _inside(distribution.base_dist, value, masked)
+        inside = _inside(distribution.base_dist, value, any_turn, masked)
         return ~_any_entry(~inside, distribution.reinterpreted_batch_ndims)
     if isinstance(distribution, ExpandedDistribution):
-        return _inside(distribution.base_dist, value, masked)
+        return _inside(distribution.base_dist, value, any_turn, masked)
     support = whole_support(distribution)
     inside = ~_any_entry(~support.check(value), len(distribution.event_shape) - support.event_dim)
+    if _comes_from_within(distribution, any_turn):
+        for transform in reversed(distribution.transforms):
+            value = transform.inv(value)
+        return inside & _inside(distribution.base_dist, value, any_turn, masked)
+    if masked and isinstance(distribution, Multinomial | DirichletMultinomial):
+        # Their densities are those given the counts' own total, their supports hold smaller ones too.
+        inside = inside & (value.sum(dim=-1) == distribution.total_count)
     return inside & has_probability(distribution, value) if support.is_discrete else inside
 
 

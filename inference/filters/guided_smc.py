@@ -48,7 +48,7 @@ from bcppl.inference.kernels import Kernel, metropolis_hastings, sequence, surro
 from bcppl.inference.kernels.kernel import Move
 from bcppl.inference.kernels.rejuvenation import Moved, Until, moved_by, until
 from bcppl.inference.population import Population
-from bcppl.inference.proposals import drift
+from bcppl.inference.proposals import drift, prior
 from bcppl.inference.proposals.approximated import (
     backward_kernel,
     conditional_proposal,
@@ -94,6 +94,8 @@ def gaussian_proposals(approximation: Any) -> Sequence[Program]:
 def kernel(pose: str, proposals: Callable[[Any], Sequence[Program]], *, screen: bool = True) -> Kernel:
     """A random walk of one other latent value, and two of the approximation's proposals.
 
+    One that cannot walk, such as a discrete one, is redrawn from the program.
+
     `proposals` are those that go with the approximation that the population carries: the first is made in
     every sweep, and one of the others; a random walk of the pose where there are none. Where the program runs
     physics and these are to `screen`, they move by what is approximated (`approximated`), and physics decides
@@ -101,8 +103,9 @@ def kernel(pose: str, proposals: Callable[[Any], Sequence[Program]], *, screen: 
     """
 
     def move_of(population: Population) -> Move:
-        others = [address for address in continuous_addresses(population.trace) if address != pose]
-        walks = [metropolis_hastings(drift(other, WALK)) for other in others]
+        walking = continuous_addresses(population.trace)
+        others = [address for address in population.trace.choices if address != pose]
+        walks = [metropolis_hastings(drift(a, WALK) if a in walking else prior(a)) for a in others]
         of_pose: list[Any] = [*proposals(population.approximation)] or [drift(pose, WALK)]
         first, *further = (metropolis_hastings(proposal) for proposal in of_pose)
         guided = [first, *_one_of(further)]

@@ -26,7 +26,7 @@ from typing import Any
 from torch import Tensor
 
 from bcppl.arguments import number_within, whole_number
-from bcppl.distributions.support import freedom_of, support_of
+from bcppl.distributions.support import freedom_of
 from bcppl.errors import InputError
 from bcppl.inference.filters.searching import Searching
 from bcppl.inference.filters.smc import Step, smc
@@ -52,8 +52,8 @@ def kernel(
 ) -> Kernel:
     """Random walks of a pose at two scales, and independent moves fitted to the other particles.
 
-    Discrete values (which of several holes it is) are redrawn from the program. Other continuous latent
-    values (a camera's error, a grasp) walk alone, and together with the pose.
+    Other continuous latent values (a camera's error, a grasp) walk alone, and together with the pose. Those
+    that cannot, such as discrete ones (which of several holes it is), are redrawn from the program.
 
     Args:
         pose: its address.
@@ -82,11 +82,10 @@ def kernel(
     shaped = sequence([move_of, *given]) if given else move_of
 
     def with_choices(population: Population) -> Move:
-        sites = population.trace.distributions
-        choices = [a for a in population.trace.choices if support_of(sites[a]).is_discrete]
+        walking = continuous_addresses(population.trace)
         # Without moves between them, resampling alone lets choices die out that the data cannot distinguish.
-        redraws = [metropolis_hastings(prior(choice)) for choice in choices]
-        return sequence([shaped, *redraws])(population) if choices else shaped(population)
+        redraws = [metropolis_hastings(prior(a)) for a in population.trace.choices if a not in walking]
+        return sequence([shaped, *redraws])(population) if redraws else shaped(population)
 
     return with_choices
 

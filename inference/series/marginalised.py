@@ -30,8 +30,10 @@ from bcppl.distributions.lazy import LazyDistribution
 from bcppl.errors import InputError
 from bcppl.inference.series.nested import Filters
 from bcppl.inference.series.unrolling import numbered, refuse_no_steps
-from bcppl.traces import Series, carried, extend, simulate
+from bcppl.traces import Series, carried, simulate
 from bcppl.traces.differentiation.graph import kept
+from bcppl.traces.run import run
+from bcppl.traces.series import SeriesTrace
 
 
 class SeriesLikelihood(LazyDistribution):
@@ -155,13 +157,16 @@ class Marginal:
         kind = _kind((args, step))
         if kind not in self._shapes:
             with torch.random.fork_rng(devices=[]):
-                trace, _ = extend(simulate(self.series, args), step, {})
-            if self.observed not in trace.addresses:
+                begun = simulate(self.series, args)
+                assert isinstance(begun, SeriesTrace)
+                # Not `extend`: a step may mask the density of what was not seen.
+                ran = run(begun.next_stage(), step, begun.particles, {}, begun.carried, draws_lazy=False)
+            if self.observed not in ran.distributions:
                 raise InputError(
                     f"a series' step visits no observation {self.observed!r}; "
-                    f"it visits {', '.join(trace.addresses) or 'none'}."
+                    f"it visits {', '.join(ran.distributions) or 'none'}."
                 )
-            site = trace.distributions[self.observed]
+            site = ran.distributions[self.observed]
             self._shapes[kind] = (*site.batch_shape[:-1], *site.event_shape)
         return self._shapes[kind]
 

@@ -23,7 +23,15 @@ from bcppl.inference.summaries import mean
 from bcppl.inference.targets import POSTERIOR
 from bcppl.traces import Series, Trace, assess, extend, generate, gradients, simulate, update
 from bcppl.traces.carried import carried
-from tests.inference.series.linear_series import AUTOREGRESSION, SEEN, log_evidence, observed, posterior, step
+from tests.inference.series.linear_series import (
+    AUTOREGRESSION,
+    NOISE,
+    SEEN,
+    log_evidence,
+    observed,
+    posterior,
+    step,
+)
 from tests.invariance import number
 
 T = 8
@@ -44,6 +52,25 @@ def test_the_estimated_likelihood_is_unbiased(threshold: float) -> None:
     z = (ratio.mean(dim=1) - 1.0) / (ratio.std(dim=1) / math.sqrt(4000))
     assert float(z.abs().max()) < 4.0, z
     assert bool((ratio.std(dim=1) > 0.3).all()), "the estimates are random"
+
+
+@pytest.mark.parametrize("as_tensor", [True, False])
+def test_a_step_may_mask_what_was_not_seen(as_tensor: bool) -> None:
+    """Without correlation each step is seen by itself: y/1 and y/3 are normal, y/2 says nothing."""
+
+    def masked(state: dict[str, Tensor], seen: bool | Tensor) -> dict[str, Tensor]:
+        x = pyro.sample("x", dist.Normal(state["rho"] * state["x"], 1.0))
+        pyro.sample("y", dist.Normal(x, NOISE).mask(seen))
+        return {"rho": state["rho"], "x": x}
+
+    torch.manual_seed(1)
+    rho, y = torch.zeros(4000, dtype=torch.float64), {"y/1": 0.3, "y/2": 50.0, "y/3": 1.0}
+    steps = [(torch.tensor(each) if as_tensor else each,) for each in (True, False, True)]
+    program = marginal(Series(AUTOREGRESSION.init, masked), "rho", observed="y", particles=8)
+    trace, log_weight = generate(program, (steps,), y, 4000, {"rho": rho})
+    exact = dist.Normal(0.0, math.sqrt(1.0 + NOISE**2)).log_prob(torch.tensor([0.3, 1.0])).sum()
+    ratio = (log_weight - trace.log_prob("rho") - exact).exp()
+    assert abs(float((ratio.mean() - 1.0) / (ratio.std() / math.sqrt(4000)))) < 4.0
 
 
 def advances(monkeypatch: pytest.MonkeyPatch) -> list[int]:
