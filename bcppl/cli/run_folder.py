@@ -73,7 +73,12 @@ class RunFolder:
                 f"the run in {path} has beliefs and no {STEP} to go on from; run the recording again into "
                 "another folder."
             )
-        self.note(complete=False, rows=[], checked={})
+        try:
+            self.note(complete=False, rows=[], checked={})
+        except InputError:
+            if not begun:  # of a run that has not begun nothing is left in its way
+                self.discard()
+            raise
 
     @classmethod
     def resumed(cls, path: Path, record: Mapping[str, Any], recording: Recording, taken: int) -> RunFolder:

@@ -85,6 +85,7 @@ class Sampler:
 
     Attributes:
         counts: by stream, "wrench" and "pose".
+        fault: where messages were lost for too long, that error: no window comes after it.
 
     Raises:
         InputError: a number is out of range.
@@ -102,6 +103,7 @@ class Sampler:
         number = np.floor((stamps - stamps[0]) / window + 1e-6)
         self._ends = [*(np.flatnonzero(np.diff(number)) + 1).tolist(), len(stamps)]
         self._first, self._done = 0, -np.inf
+        self.fault: InputError | None = None
 
     @property
     def counts(self) -> dict[str, Counts]:
@@ -140,9 +142,11 @@ class Sampler:
 
     def finish(self) -> list[Measurement]:
         """The windows that are complete without waiting any longer."""
-        return self._complete(0.0)
+        return [] if self.fault else self._complete(0.0)
 
     def _add(self, name: str, stamp: float, values: Array) -> list[Measurement]:
+        if self.fault is not None:
+            raise self.fault
         messages = self._streams[name]
         if values.shape != (messages.width,) or not (np.isfinite(values).all() and np.isfinite(stamp)):
             raise InputError(
@@ -186,10 +190,11 @@ class Sampler:
         gaps = times[after] - times[after - 1]
         if gaps.max() > self.longest:
             at = int(gaps.argmax())
-            raise InputError(
+            self.fault = InputError(
                 f"the {name} stream has no message from {times[after[at] - 1]:.3f} to "
                 f"{times[after[at]]:.3f} s, "
                 "too long to interpolate a contact; begin another probe."
             )
+            raise self.fault
         messages.counts.bridged += int((gaps > 1.5 * stream.step).sum())
         return stream

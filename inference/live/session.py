@@ -41,6 +41,12 @@ LATEST = 2.0**32  # s: beyond it a float cannot tell stamps a microsecond apart
 LOG = logging.getLogger(__name__)
 
 Answer = dict[str, Any]
+# What each request may hold besides, and what names it.
+FIELDS = {
+    "begin": {"plan", "name", "begin", "seconds", "rate"},
+    "samples": {"wrench", "pose"},
+    "view": {"camera", "depth"},
+}
 
 
 class Session:
@@ -69,6 +75,10 @@ class Session:
         try:
             if not isinstance(asked, str) or asked not in self._asked:
                 raise InputError(f"{str(asked)[:40]!r} is asked for; ask for {', '.join(self._asked)}.")
+            fields = FIELDS.get(asked, set())
+            if unknown := sorted(map(str, set(request) - fields - {"ask"})):
+                known = f"its fields are {', '.join(sorted(fields))}" if fields else "it has none"
+                raise InputError(f"{asked!r} has no field {unknown[0][:40]!r}; {known}.")
             return self._asked[asked](request)
         except (InputError, InferenceError) as error:
             return {"error": str(error)}
@@ -82,11 +92,11 @@ class Session:
 
     def _begin(self, request: Mapping[str, Any]) -> Answer:
         if "plan" in request:
-            probe = probe_of(_read(_layout("window").candidate, request["plan"], "the plan"))
+            plan = _read(_layout("window").candidate, request["plan"], "the plan")
+            _refuse_many(float(plan.times[-1] - plan.times[0]), plan.rate)
+            probe = probe_of(plan)
         else:
             probe = _unknown(request)
-        if len(probe.stamps) > MOST_STAMPS:
-            raise InputError(f"the probe has {len(probe.stamps)} stamps; give {MOST_STAMPS} at most.")
         for problem in checks.times(f"the probe {probe.name[:40]!r}", probe.stamps):
             raise InputError(problem)
         with self._lock:
@@ -101,12 +111,16 @@ class Session:
 
     def _samples(self, request: Mapping[str, Any]) -> Answer:
         rows = {name: _rows(request, name, width) for name, width in (("wrench", 7), ("pose", 8))}
+        if not any(map(len, rows.values())):
+            raise InputError("samples has no rows; send those of the wrench, of the pose or both.")
         count = 0
         refused: list[InputError] = []
         with self._lock:
             sampler = self._begun()
             for name, add in (("wrench", sampler.wrench), ("pose", sampler.pose)):
                 for row in rows[name]:
+                    if sampler.fault is not None and refused:
+                        break  # no window comes after it, and each row would have the same answer
                     try:
                         _refuse_row(name, row)
                         count += self._observe(add(float(row[0]), row[1:]))
@@ -195,9 +209,15 @@ def _unknown(request: Mapping[str, Any]) -> Probe:
     seconds = number_within("a probe lasts {} s", request.get("seconds"), least=1.0 / rate, most=LONGEST)
     if not isinstance(name, str) or not name:
         raise InputError("a probe begins without a name; give it one.")
+    _refuse_many(seconds, rate)
     stamps = begin + np.arange(max(1, round(seconds * rate))) / rate
     still = np.tile([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], (2, 1))
     return Probe(name, np.array([begin, begin + seconds]), still, np.zeros(6), np.zeros(6), stamps)
+
+
+def _refuse_many(seconds: float, rate: float) -> None:
+    if seconds * rate > MOST_STAMPS:
+        raise InputError(f"the probe has {seconds * rate:.0f} stamps; give {MOST_STAMPS} at most.")
 
 
 def _rows(request: Mapping[str, Any], name: str, width: int) -> Array:

@@ -106,6 +106,14 @@ def test_what_cannot_be_resumed_is_refused(bcppl: Callable[..., Ran], tmp_path: 
         ("run", "--resume", "nowhere"): "there is no run in nowhere",
         ("run", "--resume", "out"): "data never runs code",
         ("run", "--resume", "out", "--inference", FEW_MOVES, "--seed", 3): "--seed is that of the run in out",
+        (
+            "run",
+            "--resume",
+            "out",
+            "--inference",
+            "guided_smc",
+        ): "--inference is 'guided_smc', and the",
+        ("run", "--resume", "out", "--model", "peg_in_hole"): "--model is 'peg_in_hole', and the run",
     }.items():
         ran = bcppl(*words)
         assert ran.code == 2 and sentence in ran.err, ran.err

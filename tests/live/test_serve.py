@@ -6,6 +6,7 @@ import asyncio
 import socket
 import struct
 import threading
+import tracemalloc
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
@@ -266,3 +267,42 @@ def test_a_session_knows_the_probes_of_the_recording_that_it_begins_with() -> No
             {"ask": "begin", "name": window.action.probe.name, "begin": 0.0, "rate": 100.0, "seconds": 1.0}
         )
     assert "there was a probe called" in answer["error"]
+
+
+@pytest.mark.parametrize(
+    ("asked", "sentence"),
+    [
+        (
+            {"ask": "samples", "wrenches": [[0.0] * 7]},
+            "'samples' has no field 'wrenches'; its",
+        ),
+        ({"ask": "belief", "of": "part"}, "'belief' has no field 'of'; it has none"),
+        ({"ask": "samples"}, "samples has no rows"),
+    ],
+)
+def test_a_field_that_is_unknown_is_not_passed_over(
+    session: Session, asked: dict[str, Any], sentence: str
+) -> None:
+    assert sentence in session.answer(asked)["error"]
+
+
+def test_a_probe_of_too_many_stamps_is_refused_before_they_are_made(session: Session) -> None:
+    tracemalloc.start()
+    probe = {"ask": "begin", "name": "p", "begin": 0.0, "rate": 1e5, "seconds": 600.0}
+    assert "60000000 stamps" in session.answer(probe)["error"]
+    assert tracemalloc.get_traced_memory()[1] < 1e6
+    tracemalloc.stop()
+
+
+def test_after_a_gap_rows_are_not_looked_at_any_more(session: Session) -> None:
+    session.answer({"ask": "begin", "name": "first", "begin": 0.0, "rate": 100.0, "seconds": 4.0})
+    stamps = np.arange(-0.1, 4.2, 0.01)
+    pose = np.column_stack([stamps, np.tile([0.5, 0.0, 0.3, 1.0, 0.0, 0.0, 0.0], (len(stamps), 1))])
+    wrench = np.column_stack([stamps, np.zeros((len(stamps), 6))])[(stamps < 0.995) | (stamps > 1.1)]
+    for part in (slice(0, 200), slice(200, None)):
+        request = {"ask": "samples", "wrench": wrench[part], "pose": pose[part]}
+        assert "the wrench stream has no message from 0.99" in session.answer(request)["error"]
+    kept = session._sampler and len(session._sampler._streams["pose"].times)
+    assert kept and kept < 200
+    ended = session.answer({"ask": "end"})
+    assert ended["windows"] == 0 and ended["missing"] > 200

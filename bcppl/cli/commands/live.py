@@ -73,12 +73,9 @@ def live(
     """Play a recording as if it were being made, and follow it: how late each update was, and the belief."""
     from rich.console import Console
 
-    from bcppl.cli import latent_sites
     from bcppl.cli.arm import arm_with_peg
     from bcppl.cli.report import Report
     from bcppl.inference.live import Filter, play
-    from bcppl.recordings.beliefs import save_belief
-    from bcppl.recordings.fingerprint import fingerprint
 
     for option, file in (("--out", out), ("--save", save)):
         if file is not None:
@@ -89,7 +86,7 @@ def live(
     console = Console(highlight=False)
     measured, chosen, infer = _chosen(recording, model, inference, set_)
     report = Report(console, measured, chosen)
-    empty = replace(measured, measurements=[])
+    empty, interrupted = replace(measured, measurements=[]), False
 
     def shown(step: Step, update: UpdateInfo) -> None:
         if not update.fault:
@@ -100,8 +97,12 @@ def live(
         page = following.view(recording, arm) if view or save else None
         asked = view and page is not None and _asked(page, console)
         report.row(following.step)
-        for measurement in play(measured, speed):
-            following.observe(measurement.action, measurement.observation)
+        try:
+            for measurement in play(measured, speed):
+                following.observe(measurement.action, measurement.observation)
+        except KeyboardInterrupt:
+            interrupted = True
+            console.print("interrupted; what has been measured is kept", style="yellow")
         last = following.settle()
         report.recording = following.recording
         report.finish()
@@ -112,16 +113,26 @@ def live(
         page.page().save(save)
         console.print(f"the page is in {save}", markup=False)
     if out is not None:
-        save_belief(
-            last.belief,
-            out,
-            label=last.info.label,
-            log_evidence=last.info.log_evidence,
-            random_state=last.random_state,
-            latent=latent_sites.values_of(last),
-            of=fingerprint(following.recording, last.taken),
-        )
+        _save(last, following.recording, out)
         console.print(f"the belief is in {out}", markup=False)
+    if interrupted:
+        raise KeyboardInterrupt
+
+
+def _save(last: Step, recording: Recording, out: Path) -> None:
+    from bcppl.cli import latent_sites
+    from bcppl.recordings.beliefs import save_belief
+    from bcppl.recordings.fingerprint import fingerprint
+
+    save_belief(
+        last.belief,
+        out,
+        label=last.info.label,
+        log_evidence=last.info.log_evidence,
+        random_state=last.random_state,
+        latent=latent_sites.values_of(last),
+        of=fingerprint(recording, last.taken),
+    )
 
 
 def _asked(page: LivePage, console: Console) -> bool:
@@ -164,6 +175,15 @@ def serve(
     particles: PARTICLES = 75,
     seed: SEED = 0,
     deadline: DEADLINE = 0.5,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            "-o",
+            file_okay=False,
+            help="Folder for the recording of all that was measured, and the last belief, at the end.",
+        ),
+    ] = None,
     view: VIEW = False,
     set_: Settings = None,
 ) -> None:
@@ -178,7 +198,13 @@ def serve(
     from bcppl.inference.live import Filter
     from bcppl.inference.live.server import Server
     from bcppl.inference.live.session import Session
+    from bcppl.recordings import save
 
+    if out is not None:
+        for name in ("recording.h5", "belief.h5"):
+            if (out / name).exists():
+                raise InputError(f"--out {out} has a {name} already; give another folder.")
+        out.mkdir(parents=True, exist_ok=True)
     console = Console(highlight=False)
     measured, chosen, infer = _chosen(scene, model, inference, set_)
     settings: dict[str, Any] = {"particles": particles, "seed": seed, "deadline": deadline}
@@ -186,7 +212,14 @@ def serve(
         if view:
             _asked(following.view(scene), console)
         server = Server(Session(following), host, port, token)
-        asyncio.run(_serving(server, console))
+        try:
+            asyncio.run(_serving(server, console))
+        finally:
+            if out is not None:
+                last = following.settle()
+                save(following.recording, out / "recording.h5")
+                _save(last, following.recording, out / "belief.h5")
+                console.print(f"recording and belief are in {out}", markup=False)
 
 
 async def _serving(server: Server, console: Console) -> None:

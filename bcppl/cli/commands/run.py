@@ -79,7 +79,14 @@ def run(
             raise InputError(
                 f"--{option} is that of the run in {resume}; leave it out, or begin another run."
             )
-        recording, particles, seed = recording or record["recording"], record["particles"], record["seed"]
+        for option, other in (("model", model), ("inference", inference)):
+            if other not in (None, record[option]):
+                raise InputError(
+                    f"--{option} is {other!r}, and the run in {resume} has {record[option]!r}; give that "
+                    "one, or begin another run."
+                )
+        record["recording"] = recording = recording or record["recording"]
+        particles, seed = record["particles"], record["seed"]
         device = record["device"]
     if recording is None:
         raise InputError("there is nothing to run; give a recording, or the folder of a run by --resume.")

@@ -12,6 +12,7 @@ import pytest
 from bcppl.errors import InputError
 from bcppl.recordings.importers.bag.images import Intrinsics
 from bcppl.recordings.importers.bag.reading import Bag
+from bcppl.recordings.importers.bag.rows import Rows, wrench
 from bcppl.recordings.importers.bag.transforms import Transforms
 from bcppl.recordings.importers.bench.configuration.camera_fields import CameraFields
 from tests.recordings.importers import bag_logs
@@ -106,3 +107,35 @@ def test_rectified_images_have_the_lens_of_the_projection(tmp_path: Path) -> Non
 def test_intrinsics_that_change_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"states other intrinsics from 11\.500 s on; cut the bag there"):
         intrinsics(tmp_path, "/depth/image_raw", lambda k: 176.0 if k < 15 else 160.0)
+
+
+def wrenches(folder: Path, headers: Callable[[int], tuple[float, str]], rows: Rows) -> Any:
+    """The rows of 20 wrenches with headers of a stamp and a frame, received in 2023."""
+
+    def messages(types: bag_logs.Types) -> Iterator[bag_logs.Row]:
+        zero = types("geometry_msgs/Vector3", 0.0, 0.0, 1.0)
+        for k in range(20):
+            felt = types("geometry_msgs/Wrench", zero, zero)
+            each = types("geometry_msgs/WrenchStamped", types.header(*headers(k)), felt)
+            yield 1.7e9 + 0.01 * k, "/ft", "geometry_msgs/WrenchStamped", each
+
+    with Bag(bag_logs.write(folder / "ft", "mcap", messages)) as bag:
+        for message in bag.messages(["/ft"]):
+            rows.add(bag, message)
+    return rows.rows()
+
+
+def test_two_sensors_on_one_topic_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="/ft has messages in two frames, 'left' and 'right'; copy those"):
+        wrenches(tmp_path, lambda k: (10.0 + k, ["left", "/left", "right"][k % 3]), Rows("/ft", wrench))
+
+
+def test_a_stamp_of_zero_is_a_time_where_time_begins_at_zero(tmp_path: Path) -> None:
+    table, notes = wrenches(tmp_path, lambda k: (0.01 * k, "ft"), Rows("/ft", wrench))
+    assert table[:, 0] == pytest.approx(0.01 * np.arange(20)) and not notes
+
+
+def test_a_stamp_of_zero_is_that_of_reception_on_the_same_clock(tmp_path: Path) -> None:
+    table, notes = wrenches(tmp_path, lambda k: (k % 2 and 1.7e9 + 0.01 * k, "ft"), Rows("/ft", wrench))
+    assert table[:, 0] == pytest.approx(1.7e9 + 0.01 * np.arange(20), abs=0.03)
+    assert notes == ["10 of 20 header stamps are zero, and the time of reception stands for them"]

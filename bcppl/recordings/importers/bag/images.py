@@ -10,7 +10,7 @@ import numpy as np
 
 from bcppl.arrays import Array
 from bcppl.errors import InputError
-from bcppl.recordings.importers.bag.reading import Bag, Message, stamped
+from bcppl.recordings.importers.bag.reading import Bag, Message
 from bcppl.recordings.importers.bag.rows import unstamped_words
 from bcppl.recordings.importers.bench.configuration.camera_fields import CameraFields, ImageFields
 from bcppl.recordings.importers.bench.configuration.field_types import Length, factor
@@ -46,10 +46,10 @@ class Images:
 
     def add(self, bag: Bag, message: Message) -> None:
         """Keep an image if it is wanted, as it is stored."""
-        stamp = bag.header_stamp(message)
+        stamp, unstamped = bag.raw_stamped(message)
         self._count += 1
-        self._unstamped += not stamp
-        stamp, self._parse = stamp or message.received, bag.parsed
+        self._unstamped += unstamped
+        self._parse = bag.parsed
         if self._fields.every is not None:
             if stamp >= self._due:
                 self._due = stamp + self._fields.every * (1.0 - 1e-3)  # stamps scatter by less
@@ -118,7 +118,7 @@ class Intrinsics:
         if self._first is None:
             self._first = info
         elif self._changed is None and _stated(info) != _stated(self._first):
-            self._changed = stamped(info.header, message.received)[0]
+            self._changed = bag.stamped(info.header, message)[0]
 
     def of(self, name: str, fields: CameraFields) -> CameraFields:
         """The fields with the intrinsics that the message states.

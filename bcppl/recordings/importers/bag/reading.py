@@ -25,6 +25,7 @@ JOINTS = "sensor_msgs/msg/JointState"
 IMAGE = "sensor_msgs/msg/Image"
 CAMERA = "sensor_msgs/msg/CameraInfo"
 
+APART = 60.0  # s from the time of reception: a clock that was never set by the recorder's
 _TRANSFORMS = "geometry_msgs/TransformStamped[] transforms"  # which the types of ROS 1 in rosbags lack
 _REMEDY = (
     "copy it again, or repair it with `rosbag reindex`, `ros2 bag reindex` or `mcap recover`, as is its kind"
@@ -75,6 +76,7 @@ class Bag:
         self.path = path
         self._reader, self._store = _opened(path)
         self.is_ros1 = path.suffix == ".bag"
+        self._own_clock: dict[str, bool] = {}
         try:
             self._reader.open()
             self.topics = _topics(self._reader.connections)
@@ -133,22 +135,54 @@ class Bag:
         Raises:
             InputError: the bag is damaged.
         """
+        for name in names:
+            if name in self.topics and name not in self._own_clock:
+                self._own_clock[name] = self._has_own_clock(name)
+        count = 0
+        for message in self._stored(names):
+            count += 1
+            yield message
+        if count < (stated := sum(self.topics[name].count for name in names if name in self.topics)):
+            raise self._damaged(f"it holds {count} of {stated} messages")
+
+    def _stored(self, names: Collection[str]) -> Iterator[Message]:
         wanted = [each for each in self._reader.connections if each.topic in names]
         if not wanted:
             return
-        count = 0
         stored = self._reader.messages(connections=wanted)
         while True:
             try:
                 connection, received, raw = next(stored)
             except StopIteration:
-                break
+                return
             except Exception as error:
                 raise self._damaged(error) from error
-            count += 1
             yield Message(connection.topic, connection.msgtype, 1e-9 * received, raw)
-        if count < (stated := sum(self.topics[name].count for name in names if name in self.topics)):
-            raise self._damaged(f"it holds {count} of {stated} messages")
+
+    def _has_own_clock(self, name: str) -> bool:
+        """Whether the stamps of a topic's headers are on another clock than that of reception.
+
+        So is simulated time, which begins at 0: a stamp of 0 is a time there.
+        """
+        if self.topics[name].type == TRANSFORMS:
+            return False  # each has a header of its own, and those that stand still have no time
+        for message in self._stored([name]):
+            if stamp := self.header_stamp(message):
+                return abs(message.received - stamp) > APART
+        return False
+
+    def stamped(self, header: Any, message: Message) -> tuple[float, bool]:
+        """The stamp (s) of a header, and whether it is that of reception, in place of none."""
+        return self._or_reception(header.stamp.sec + 1e-9 * header.stamp.nanosec, message)
+
+    def raw_stamped(self, message: Message) -> tuple[float, bool]:
+        """The same of a message that begins with a header, without parsing the rest."""
+        return self._or_reception(self.header_stamp(message), message)
+
+    def _or_reception(self, stamp: float, message: Message) -> tuple[float, bool]:
+        if stamp or self._own_clock.get(message.topic):
+            return stamp, False
+        return message.received, True
 
     def parsed(self, message: Message) -> Any:
         """The fields of a message.
@@ -183,12 +217,6 @@ class Bag:
         cause = reason_of(error)
         place = f"{what}in {self.path}" if what else str(self.path)
         return InputError(f"{place} cannot be read ({cause[:200]}); {_REMEDY}.")
-
-
-def stamped(header: Any, received: float) -> tuple[float, bool]:
-    """The stamp (s) of a header, and whether it is zero; then it is the time of reception."""
-    stamp = header.stamp.sec + 1e-9 * header.stamp.nanosec
-    return (stamp, False) if stamp else (received, True)
 
 
 def _topics(connections: Any) -> dict[str, Topic]:

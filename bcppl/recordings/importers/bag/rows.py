@@ -10,7 +10,7 @@ import numpy as np
 
 from bcppl.arrays import Array
 from bcppl.errors import InputError
-from bcppl.recordings.importers.bag.reading import Bag, Message, stamped
+from bcppl.recordings.importers.bag.reading import Bag, Message
 
 
 class Collector(Protocol):
@@ -31,11 +31,23 @@ class Rows:
     def __init__(self, topic: str, numbers: Callable[[Any], Sequence[float]]) -> None:
         self.topic, self._numbers = topic, numbers
         self._flat, self._count, self._unstamped = array("d"), 0, 0
+        self._frame: str | None = None
 
     def add(self, bag: Bag, message: Message) -> None:
-        """Keep a message's row."""
+        """Keep a message's row.
+
+        Raises:
+            InputError: it is in another frame than those before.
+        """
         parsed = bag.parsed(message)
-        stamp, unstamped = stamped(parsed.header, message.received)
+        frame = str(parsed.header.frame_id).lstrip("/")
+        self._frame = frame if self._frame is None else self._frame
+        if frame != self._frame:
+            raise InputError(
+                f"{self.topic} has messages in two frames, {self._frame[:40]!r} and {frame[:40]!r}; copy "
+                "those of one to a bag of their own, and import that."
+            )
+        stamp, unstamped = bag.stamped(parsed.header, message)
         self._keep(stamp, self._numbers(parsed))
         self._unstamped += unstamped
 
@@ -79,7 +91,7 @@ class JointRows(Rows):
         if places is None or len(parsed.position) < len(there):
             self._others += 1
             return
-        stamp, unstamped = stamped(parsed.header, message.received)
+        stamp, unstamped = bag.stamped(parsed.header, message)
         self._keep(stamp, [float(parsed.position[place]) for place in places])
         self._unstamped += unstamped
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from bcppl.arrays import Array
 from bcppl.errors import InputError
-from bcppl.recordings.importers.bag.reading import Bag, Message, stamped
+from bcppl.recordings.importers.bag.reading import Bag, Message
 from bcppl.recordings.importers.bag.rows import unstamped_words
 from bcppl.recordings.importers.bench.pose_columns import UNIT, composed, inverted
 from bcppl.recordings.importers.bench.wrenches import IDENTITY
@@ -201,6 +201,6 @@ def _keep(edges: dict[tuple[str, str], _Edge], bag: Bag, message: Message, fixed
         if edge.is_fixed:
             edge.changes |= bool(before) and not np.allclose(before, numbers, rtol=0.0, atol=1e-9)
             del edge.flat[:]
-        stamp, unstamped = stamped(each.header, message.received)
+        stamp, unstamped = bag.stamped(each.header, message)
         edge.unstamped += unstamped
         edge.flat.extend((stamp, *numbers))
