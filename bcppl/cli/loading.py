@@ -61,6 +61,10 @@ def settings(given: Sequence[str]) -> dict[str, Any]:
         name, equals, value = each.partition("=")
         if not (equals and name.isidentifier()):
             raise InputError(f"--set is given {each!r}; give a setting's name and value, --set profile=ur5e.")
+        if name in read:
+            raise InputError(
+                f"--set gives {name} twice; give it once (`bcppl sweep` runs each value that it is given)."
+            )
         try:
             read[name] = json.loads(value)
         except (ValueError, RecursionError):

@@ -2,9 +2,23 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 
 from bcppl.errors import InputError
+
+
+def files_of_run(name: str | Path) -> list[Path]:
+    """The files of a run, and its recording, where a command reads its folder or a file in it."""
+    from bcppl.cli.run_folder import RECORD, STEP, read_record
+
+    folder = Path(name) if Path(name).is_dir() else Path(name).parent
+    if not (folder / RECORD).is_file():
+        return []
+    with suppress(InputError):
+        named = Path(read_record(folder)["recording"])
+        return [named, folder / RECORD, folder / STEP, *folder.glob("belief_*.h5")]
+    return [folder / RECORD]
 
 
 def refuse_overwriting(option: str, file: Path, *read: str | Path | None) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from bcppl.arrays import Array, spanned
+from bcppl.arrays import Array, as_array, spanned
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -21,6 +21,10 @@ class Touch:
     times: Array
     wrench: Array
     world_from_peg: Array
+
+    def __post_init__(self) -> None:
+        for name in ("times", "wrench", "world_from_peg"):
+            object.__setattr__(self, name, as_array(getattr(self, name)))
 
     def __repr__(self) -> str:
         return f"Touch({spanned(self.times)})"

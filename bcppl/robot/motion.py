@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from bcppl.arrays import Array, spanned
+from bcppl.arrays import Array, as_array, spanned
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -27,6 +27,10 @@ class Probe:
     stiffness: Array
     damping: Array
     stamps: Array
+
+    def __post_init__(self) -> None:
+        for name in ("command_times", "command", "stiffness", "damping", "stamps"):
+            object.__setattr__(self, name, as_array(getattr(self, name)))
 
     def __repr__(self) -> str:
         return f"Probe({self.name!r}, {spanned(self.stamps)})"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import pyro
@@ -138,6 +138,8 @@ def _links(population: Population, addresses: tuple[str, ...]) -> list[_Link]:
 
 def _log_scales(scales: tuple[float, float]) -> Tensor:
     """The logarithms (2,) of the smallest and the largest scale."""
+    if not isinstance(scales, Sequence) or len(scales) != 2:
+        raise InputError(f"drift is given the scales {scales!r}; give two, as (0.05, 1.0).")
     smallest, largest = (number_within("drift is given the scale {}", s, above=0.0) for s in scales)
     if smallest > largest:
         raise InputError(

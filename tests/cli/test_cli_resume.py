@@ -97,12 +97,31 @@ def test_beliefs_without_a_step_to_go_on_from_are_kept(bcppl: Callable[..., Ran]
     assert sorted((file.name, file.read_bytes()) for file in (tmp_path / "out").iterdir()) == before
 
 
+def test_a_run_s_own_files_and_recording_are_not_written_over(
+    bcppl: Callable[..., Ran], tmp_path: Path
+) -> None:
+    save(short(1), tmp_path / "short.h5")
+    assert bcppl("run", "short.h5", "--particles", 4, "--inference", FEW_MOVES, "--out", "out").code == 0
+    before = {file: file.read_bytes() for file in (tmp_path / "short.h5", tmp_path / "out/run.json")}
+    for words in (
+        ("view", "out", "--save", "short.h5"),
+        ("view", "out", "--save", "out/run.json"),
+        ("probe", "out/belief_001.h5", "--candidates", "touch:2", "--output", "short.h5"),
+        ("probe", "out/belief_001.h5", "--candidates", "touch:2", "--output", "out/run.json"),
+        ("insert", "out/belief_001.h5", "--output", "out/run.json"),
+    ):
+        ran = bcppl(*words)
+        assert ran.code == 2 and f"would overwrite {words[-1]}, which is read" in ran.err, ran.err
+    assert before == {file: file.read_bytes() for file in before}
+
+
 def test_what_cannot_be_resumed_is_refused(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
     save(short(1), tmp_path / "short.h5")
     save(short(2), tmp_path / "other.h5")
     assert bcppl("run", "short.h5", "--particles", 4, "--inference", FEW_MOVES, "--out", "out").code == 0
     for words, sentence in {
         ("run",): "there is nothing to run",
+        ("run", "short.h5", "--set", "a=1", "--set", "a=2"): "--set gives a twice; give it once",
         ("run", "--resume", "nowhere"): "there is no run in nowhere",
         ("run", "--resume", "out"): "data never runs code",
         ("run", "--resume", "out", "--inference", FEW_MOVES, "--seed", 3): "--seed is that of the run in out",

@@ -20,8 +20,8 @@ WORDS = ("--inference", FEW_MOVES, "--particles", 8, "--out", "found")
 def test_each_combination_is_run_once_and_reads_as_a_table(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
     save(short(1), tmp_path / "one.h5")
     save(short(2), tmp_path / "two.h5")
-    ran = bcppl("sweep", "one.h5", "--seeds", "0:2", *WORDS)
-    assert ran.code == 0, ran.err
+    ran = bcppl("sweep", "one.h5", "one.h5", "--seeds", "0:2", *WORDS)
+    assert ran.code == 0 and "2 of 2 runs are in found" in ran.out, ran.err
     first = (tmp_path / "found/results.jsonl").read_text()
     ran = bcppl("sweep", "one.h5", "two.h5", "--seeds", "0:2", "--particles", 6, *WORDS)
     assert ran.code == 0 and "8 of 8 runs are in found" in ran.out

@@ -21,7 +21,7 @@ from bcppl.cli.options import (
     Settings,
     WorldFromBase,
 )
-from bcppl.cli.outputs import refuse_overwriting
+from bcppl.cli.outputs import files_of_run, refuse_overwriting
 from bcppl.errors import InputError
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ def insert(
 
     if output.suffix not in SUFFIXES:
         raise InputError(f"--output is {output}; give a file that ends in {' or '.join(SUFFIXES)}.")
-    refuse_overwriting("--output", output, recording, of, model, inference)
+    refuse_overwriting("--output", output, recording, of, model, inference, *files_of_run(recording))
     box = None if workspace is None else _box(workspace)
     point = None if inside is None else _numbers("--inside", inside, "two", "x y")
     constraints = reach(robot, link, link_from_peg, world_from_base, seed)

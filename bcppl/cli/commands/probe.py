@@ -23,7 +23,7 @@ from bcppl.cli.options import (
     Settings,
     WorldFromBase,
 )
-from bcppl.cli.outputs import refuse_overwriting
+from bcppl.cli.outputs import files_of_run, refuse_overwriting
 from bcppl.errors import InputError
 from bcppl.untrusted.visible_text import visible
 
@@ -156,7 +156,7 @@ def _picture(output: Path, given: Sequence[str]) -> Path:
         raise InputError(f"--output is {output}; give a file that ends in {' or '.join(SUFFIXES)}.")
     picture = output.with_suffix(".png")
     for file in (output, picture):
-        refuse_overwriting("--output", file, *given)
+        refuse_overwriting("--output", file, *given, *files_of_run(given[0]))
     return picture
 
 

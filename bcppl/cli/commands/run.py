@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
+from warnings import catch_warnings, simplefilter
 
 import typer
 
@@ -90,7 +91,9 @@ def run(
         device = record["device"]
     if recording is None:
         raise InputError("there is nothing to run; give a recording, or the folder of a run by --resume.")
-    measured = loading.recording(recording)
+    with catch_warnings(record=True) as warned:
+        simplefilter("always")
+        measured = loading.recording(recording)
     settings = record.get("settings") or loading.settings(set_ or [])
     named, by = record.get("model", measured.model), f"the run in {resume}" if record else "the recording"
     chosen = loading.with_settings(loading.model(model, named, by), settings, model or named)
@@ -105,7 +108,8 @@ def run(
             style="yellow",
         )
     kept = record.get("doubts")
-    doubted = [str(doubt) for doubt in kept] if isinstance(kept, list) else doubts(measured)
+    read = [str(each.message) for each in warned]
+    doubted = [str(doubt) for doubt in kept] if isinstance(kept, list) else [*read, *doubts(measured)]
     for doubt in doubted:
         console.print(f"doubt: {visible(doubt)}", style="yellow", markup=False)
     report = Report(console, measured, chosen)

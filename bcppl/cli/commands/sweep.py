@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import typer
 
@@ -18,6 +18,8 @@ from bcppl.arguments import LARGEST_SEED
 from bcppl.cli.options import Settings
 from bcppl.errors import InputError
 from bcppl.sweeps import key_of, product, swept
+
+V = TypeVar("V")
 
 RESULTS, TABLE, BELIEFS = "results.jsonl", "results.csv", "beliefs"  # in the folder
 WIDTH = 100  # columns of the table at least, also where the output is no terminal
@@ -62,13 +64,13 @@ def sweep(
 
     from bcppl.inference.progress import watched
 
-    named = _recordings(recordings or [], scenes, model or [])
-    models, programs, settings = model or [""], inference or [""], _settings(set_ or [])
+    named = _once(_recordings(recordings or [], scenes, model or []))
+    models, programs, settings = _once(model or [""]), _once(inference or [""]), _settings(set_ or [])
     cells = product(
         recording=named,
         model=models,
         inference=programs,
-        particles=particles or [75],
+        particles=_once(particles or [75]),
         settings=settings,
         seed=_numbers("--seeds", seeds),
     )
@@ -196,7 +198,13 @@ def _settings(given: Sequence[str]) -> list[dict[str, Any]]:
     axes: dict[str, list[Any]] = {}
     for name, value in (item for each in given for item in loading.settings([each]).items()):
         axes.setdefault(name, []).append(value)
-    return product(**axes)
+    once = {name: [v for k, v in enumerate(each) if v not in each[:k]] for name, each in axes.items()}
+    return product(**once)
+
+
+def _once(values: Sequence[V]) -> list[V]:
+    """Each once, as a recording that a pattern matches besides its name: the same cell has one result."""
+    return list(dict.fromkeys(values))
 
 
 def _digest(name: str) -> str:

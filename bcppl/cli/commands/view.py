@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from bcppl.cli.options import Arm, Link, LinkFromPeg, WorldFromBase
-from bcppl.cli.outputs import refuse_overwriting
+from bcppl.cli.outputs import files_of_run, refuse_overwriting
 from bcppl.errors import InputError
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ def view(
             raise InputError(f"--of names a run's recording, but {run} is no folder of a run; leave it out.")
         page, place = of_recording(run, arm), Path(f"{folder.stem}.{PAGE}")
     place = save or place
-    refuse_overwriting("--save", place, run, of)
+    refuse_overwriting("--save", place, run, of, *files_of_run(run))
     page.save(place)
     print(f"wrote {place}: {page.steps} steps, {len(page.text) / 1e6:.1f} MB; it needs no other file.")
     if save is None and not webbrowser.open(place.resolve().as_uri()):

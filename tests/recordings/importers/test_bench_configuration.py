@@ -69,6 +69,13 @@ WRONG = {
         "cameras", "wrist", "images", 0, "time"
     ),
     "clock states a drift but not wrench_late": changed("clock", value={"drift": 20.0}),
+    "clock has both wrench_late and within": changed(
+        "clock", value={"wrench_late": 8, "unit": "ms", "within": 10}
+    ),
+    "clock has wrench_late without its unit": changed("clock", value={"wrench_late": 8}),
+    "cut has both find and spans": changed("cut", value={"find": "touches", "spans": [[0.5, 2.0]]}),
+    "cut has no span in spans": changed("cut", value={"spans": []}),
+    "wrench names the column 'x' twice": changed("wrench", "columns", value=list("axxyzw")),
     "gravity needs mass": changed("gravity", value={"load": "stated"}),
     "part needs one of mesh": changed("part", "mesh"),
     "holds no fields": "just text",

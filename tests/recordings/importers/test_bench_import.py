@@ -167,7 +167,11 @@ def test_lost_rows_are_reported_and_left_out(tmp_path: Path) -> None:
     path = bench_logs.write(tmp_path, there, bench_logs.Log(skip=((7000, 7400),), more=STATED))
     with pytest.raises(InputError, match=r"touches lacks data from 7\.00 to 7\.40 s; state cut\.spans"):
         command(path)
-    path.write_text(path.read_text() + "cut: {spans: [[0.5, 6.9], [7.5, 11.5]]}\n")
+    text = path.read_text()
+    path.write_text(text + "cut: {spans: [[0.5, 6.9], [3.0, 6.0]]}\n")
+    with pytest.raises(InputError, match=r"begins at 3 s, before another ends at 6\.9 s"):
+        command(path)
+    path.write_text(text + "cut: {spans: [[0.5, 6.9], [7.5, 11.5]]}\n")
     imported = command(path)
     assert agrees(imported, there) and problems(imported.recording) == []
     names = {m.action.probe.name for m in imported.recording.measurements if m.kind == "window"}

@@ -127,6 +127,12 @@ def _spans(rows: Rows, fields: CutFields, report: list[str]) -> list[tuple[float
                     f"cut.spans[{k}] is {begin:g} to {end:g} s; give spans within the log, {first:.2f} to "
                     f"{last:.2f} s, each with its begin before its end."
                 )
+        for (_, end), (begin, _) in itertools.pairwise(sorted(spans)):
+            if begin < end:
+                raise InputError(
+                    f"cut.spans has one that begins at {begin:g} s, before another ends at {end:g} s; rows "
+                    "in both would count twice."
+                )
         return spans
     if fields.find == "whole":
         known = rows.stamps[rows.known]

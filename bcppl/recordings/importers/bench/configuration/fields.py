@@ -56,6 +56,13 @@ class StreamFields(Fields):
             raise ValueError(f"names a topic, whose messages state {name!r}; leave that out")
         return {**cls.UNLESS_STATED, **content, **cls.BY_TOPIC}
 
+    @model_validator(mode="after")
+    def _each_column_once(self) -> Self:
+        for column in self.columns:
+            if self.columns.count(column) > 1:
+                raise ValueError(f"names the column {column!r} twice; each number has its own")
+        return self
+
 
 class WrenchFields(StreamFields):
     """The wrench: its units, the axes that it is in, the point that its torques are about, and its sign."""
@@ -135,6 +142,12 @@ class ClockFields(Fields):
     def _stated_together(self) -> Self:
         if self.drift and self.wrench_late is None:
             raise ValueError("states a drift but not wrench_late; give both, or estimate: offset_and_drift")
+        if self.wrench_late is None:
+            return self
+        if estimated := sorted(self.model_fields_set & {"estimate", "within"}):
+            raise ValueError(f"has both wrench_late and {estimated[0]}; leave one of them out")
+        if self.wrench_late and "unit" not in self.model_fields_set:
+            raise ValueError("has wrench_late without its unit; give unit: ms or unit: s")
         return self
 
 
@@ -167,6 +180,14 @@ class CutFields(Fields):
     before: Above = 0.5
     after: Above = 0.3
     gap: Above | None = None
+
+    @model_validator(mode="after")
+    def _found_or_stated(self) -> Self:
+        if {"find", "spans"} <= self.model_fields_set:
+            raise ValueError("has both find and spans; leave one of them out")
+        if "spans" in self.model_fields_set and not self.spans:
+            raise ValueError("has no span in spans; give some, or leave it out")
+        return self
 
 
 class ArmFields(Fields):
