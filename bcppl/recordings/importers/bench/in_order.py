@@ -80,7 +80,7 @@ def _gaps(stream: Stream) -> Iterator[str]:
         )
     held = float((np.diff(stream.values, axis=0) == 0.0).all(axis=1).mean())
     if held > 0.3:
-        yield f"; {100.0 * held:.0f} % of the rows repeat the one before: the sensor is slower"
+        yield f"; {100.0 * held:.0f} % of the rows repeat the one before: it is slower, or stands still"
 
 
 def _rows(count: int) -> str:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
+from warnings import catch_warnings, simplefilter
 
 import numpy as np
 
@@ -74,10 +75,12 @@ def _csv(path: Path, names: Names) -> Array:
         )
     places = [_place(path, name, known, len(cells)) for name in names]
     try:
-        table = np.loadtxt(
-            path, delimiter=delimiter, skiprows=skipped, usecols=places, ndmin=2, quotechar='"',
-            encoding="utf-8-sig",
-        )  # fmt: skip
+        with catch_warnings():
+            simplefilter("ignore", UserWarning)  # that there is no row: a stream without one is refused
+            table = np.loadtxt(
+                path, delimiter=delimiter, skiprows=skipped, usecols=places, ndmin=2, quotechar='"',
+                encoding="utf-8-sig",
+            )  # fmt: skip
     except ValueError as error:
         cause = reason_of(error)
         remedy = _remedy(cause)
