@@ -146,7 +146,7 @@ class Sampler:
 
     def _add(self, name: str, stamp: float, values: Array) -> list[Measurement]:
         if self.fault is not None:
-            raise self.fault
+            raise self.fault.with_traceback(None)  # which would grow with each message
         messages = self._streams[name]
         if values.shape != (messages.width,) or not (np.isfinite(values).all() and np.isfinite(stamp)):
             raise InputError(

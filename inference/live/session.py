@@ -41,7 +41,7 @@ LATEST = 2.0**32  # s: beyond it a float cannot tell stamps a microsecond apart
 LOG = logging.getLogger(__name__)
 
 Answer = dict[str, Any]
-# What each request may hold besides, and what names it.
+# Of each request that holds more than what it asks for.
 FIELDS = {
     "begin": {"plan", "name", "begin", "seconds", "rate"},
     "samples": {"wrench", "pose"},
@@ -111,7 +111,7 @@ class Session:
 
     def _samples(self, request: Mapping[str, Any]) -> Answer:
         rows = {name: _rows(request, name, width) for name, width in (("wrench", 7), ("pose", 8))}
-        if not any(map(len, rows.values())):
+        if not request.keys() & rows.keys():
             raise InputError("samples has no rows; send those of the wrench, of the pose or both.")
         count = 0
         refused: list[InputError] = []

@@ -81,7 +81,7 @@ def run(
                 f"--{option} is that of the run in {resume}; leave it out, or begin another run."
             )
         for option, other in (("model", model), ("inference", inference)):
-            if other not in (None, record[option]):
+            if other is not None and Path(other).name != Path(record[option]).name:
                 raise InputError(
                     f"--{option} is {other!r}, and the run in {resume} has {record[option]!r}; give that "
                     "one, or begin another run."
@@ -108,7 +108,7 @@ def run(
             style="yellow",
         )
     kept = record.get("doubts")
-    read = [str(each.message) for each in warned]
+    read = [str(each.message) for each in warned if issubclass(each.category, RuntimeWarning)]
     doubted = [str(doubt) for doubt in kept] if isinstance(kept, list) else [*read, *doubts(measured)]
     for doubt in doubted:
         console.print(f"doubt: {visible(doubt)}", style="yellow", markup=False)

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
 import typer
 
@@ -18,8 +18,6 @@ from bcppl.arguments import LARGEST_SEED
 from bcppl.cli.options import Settings
 from bcppl.errors import InputError
 from bcppl.sweeps import key_of, product, swept
-
-V = TypeVar("V")
 
 RESULTS, TABLE, BELIEFS = "results.jsonl", "results.csv", "beliefs"  # in the folder
 WIDTH = 100  # columns of the table at least, also where the output is no terminal
@@ -64,16 +62,18 @@ def sweep(
 
     from bcppl.inference.progress import watched
 
-    named = _once(_recordings(recordings or [], scenes, model or []))
-    models, programs, settings = _once(model or [""]), _once(inference or [""]), _settings(set_ or [])
+    named = _recordings(recordings or [], scenes, model or [])
+    models, programs, settings = model or [""], inference or [""], _settings(set_ or [])
     cells = product(
         recording=named,
         model=models,
         inference=programs,
-        particles=_once(particles or [75]),
+        particles=particles or [75],
         settings=settings,
         seed=_numbers("--seeds", seeds),
     )
+    # A recording that a pattern matches besides its name is the same cell, and has one result.
+    cells = list({key_of(cell): cell for cell in cells}.values())
     words = {v for each in settings for v in each.values() if isinstance(v, str)}
     stated = {word for word in words if Path(word).is_file()}
     digests = {name: _digest(name) for name in {*named, *models, *programs, *stated}}
@@ -198,13 +198,7 @@ def _settings(given: Sequence[str]) -> list[dict[str, Any]]:
     axes: dict[str, list[Any]] = {}
     for name, value in (item for each in given for item in loading.settings([each]).items()):
         axes.setdefault(name, []).append(value)
-    once = {name: [v for k, v in enumerate(each) if v not in each[:k]] for name, each in axes.items()}
-    return product(**once)
-
-
-def _once(values: Sequence[V]) -> list[V]:
-    """Each once, as a recording that a pattern matches besides its name: the same cell has one result."""
-    return list(dict.fromkeys(values))
+    return product(**axes)
 
 
 def _digest(name: str) -> str:

@@ -8,7 +8,7 @@ import numpy as np
 
 from bcppl.arrays import Array, Indices
 
-KEPT = 16  # hypotheses of a particle; eight would miss a log-likelihood by up to 0.3
+KEPT = 16  # hypotheses of a particle
 # Parameters of the present contact, after those that all touches share: where it is, and by how much its
 # compliance differs. Another contact has others.
 OF_CONTACT = 2

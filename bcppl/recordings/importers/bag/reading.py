@@ -25,6 +25,7 @@ JOINTS = "sensor_msgs/msg/JointState"
 IMAGE = "sensor_msgs/msg/Image"
 CAMERA = "sensor_msgs/msg/CameraInfo"
 
+HEADED = (WRENCH, POSE, JOINTS, IMAGE, CAMERA)  # they begin with a header
 APART = 60.0  # s from the time of reception: a clock that was never set by the recorder's
 _TRANSFORMS = "geometry_msgs/TransformStamped[] transforms"  # which the types of ROS 1 in rosbags lack
 _REMEDY = (
@@ -164,8 +165,8 @@ class Bag:
 
         So is simulated time, which begins at 0: a stamp of 0 is a time there.
         """
-        if self.topics[name].type == TRANSFORMS:
-            return False  # each has a header of its own, and those that stand still have no time
+        if self.topics[name].type not in HEADED:
+            return False
         for message in self._stored([name]):
             if stamp := self.header_stamp(message):
                 return abs(message.received - stamp) > APART
