@@ -23,6 +23,8 @@ from bcppl.arrays import Array, Indices, Mask
 from bcppl.compiled import compiled
 from bcppl.contact.half_spaces import project_onto_half_spaces
 from bcppl.geometry.gap import Frames, PegGap, frames_of
+from bcppl.geometry.gap.peg_gap import Tables, measured
+from bcppl.geometry.gap.sharp_edges import dot
 from bcppl.geometry.parts import Part
 from bcppl.poses import quaternions
 from bcppl.robot.commands import interpolated_command
@@ -39,6 +41,7 @@ _ITERATIONS = 40  # of a blocked peg, for one command
 _REFUTED = 1e-6  # m
 _ALIKE = 0.99999  # cosine between the normals of two planes that count as one
 _PLANES = 4  # contacts that are remembered
+_CHUNK = 64  # pegs of a chunk of work, at least
 _MEASURED = 0.0019  # m: larger gaps are upper bounds, because edges farther away are not measured
 
 
@@ -149,12 +152,16 @@ class _Integrator:
     """The motion of N particles, integrated from command to command."""
 
     def __init__(self, model: QuasiStaticMotion, world_from_part: Tensor, command: Tensor) -> None:
+        count = len(command)
         self.model, self.part, self.command = model, frames_of(world_from_part), command
         self.separation = model.separation(world_from_part, command)
-        self.place = command[:, 0, :3].clone()
-        self.blocked = torch.ones(len(command), dtype=torch.bool)  # until measured
+        # Each peg is alone at its one stamp, as `measured` has it.
+        self.peg = Frames(np.empty((count, 1, 3, 3)), command[:, :1, :3].numpy().copy())
+        self.blocked = torch.ones(count, dtype=torch.bool)  # until measured
         # A lower bound of the distance to the part, by the last measurement and the motion since.
-        self.slack = torch.zeros(len(command), dtype=torch.float64)
+        self.slack = torch.zeros(count, dtype=torch.float64)
+        self.gap = np.empty((count, 1)), np.empty((count, 1, 3)), np.empty((count, 1, 3))
+        self.known = np.zeros(count, dtype=np.bool_)  # that gap, where the peg is now
 
     def motion(self) -> Tensor:
         """(N, T, 8)."""
@@ -180,104 +187,129 @@ class _Integrator:
     def _follow(self, goal: Tensor, moved: Tensor, free: Tensor) -> Tensor:
         """Poses and contact (N, 8) at a command (N, 7), whose surface moved by at most (N,) from the last."""
         self.slack -= moved
-        place, touches = goal[:, :3].clone(), torch.zeros(len(goal), dtype=torch.bool)
-        near = (self.blocked | ~(free | (self.slack > 0.0))).nonzero().flatten()
-        if len(near):
-            reached, distance = self._approach(near, goal[near])
-            place[near] = reached
-            off = (reached - goal[near, :3]).norm(dim=1)
+        near = self.blocked | ~(free | (self.slack > 0.0))
+        place = torch.from_numpy(self.peg.translation)[:, 0]
+        touches = torch.zeros(len(goal), dtype=torch.bool)
+        place[~near] = goal[~near, :3]
+        self.known &= near.numpy()
+        if bool(near.any()):
+            self._approach(near.numpy().nonzero()[0], goal)
+            distance = torch.from_numpy(self.gap[0])[near, 0]
+            off = (place - goal[:, :3])[near].norm(dim=1)
             self.blocked[near] = off > _CONVERGED
             touches[near] = (distance < _TOUCHES) | (off > 10.0 * _CONVERGED)
             self.slack[near] = distance.clamp(max=_MEASURED)
-        self.place = place
         return torch.cat([place, goal[:, 3:], touches[:, None].to(torch.float64)], dim=1)
 
-    def _approach(self, chosen: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
-        """Positions (M, 3) of pegs moved towards a command (M, 7), and their distances (M,) from the part."""
-        model, count = self.model, len(chosen)
-        on = chosen.numpy()
-        part = Frames(self.part.rotation[on], self.part.translation[on])
-        turn = frames_of(goal).rotation
-        place, target = self.place[chosen].numpy().copy(), goal[:, :3].numpy()
-        normals, offsets = np.zeros((count, _PLANES, 3)), np.zeros((count, _PLANES))
-        seen = np.full((count, _PLANES, 3), np.inf)
-        distance = np.full(count, np.inf)
-        moving = np.arange(count)
+    def _approach(self, chosen: Indices, goal: Tensor) -> None:
+        """Move the chosen pegs towards their commands, of (N, 7), and measure their gaps."""
+        model, part, peg, gap, known = self.model, self.part, self.peg, self.gap, self.known
+        turn = frames_of(goal).rotation[chosen]
+        known[chosen] &= (turn == peg.rotation[chosen, 0]).all(axis=(1, 2))
+        peg.rotation[chosen, 0] = turn
+        target, limits = goal[:, :3].numpy(), (model.step, model.friction, model.pressed)
+        counts = np.zeros(len(chosen), dtype=np.int64)
+
+        def work(first: int, last: int, tables: Tables) -> int:
+            on, own = chosen[first:last], counts[first:last]
+            return _approached(on, part, peg, target, tables, limits, gap, known, own)
+
+        with model.gap.effort.measure() as effort:
+            model.gap.in_threads(work, len(chosen), _CHUNK)
+            effort.items += int(counts.sum())
+
+
+@compiled
+def _approached(
+    chosen: Indices,
+    part: Frames,
+    peg: Frames,
+    target: Array,
+    tables: Tables,
+    limits: tuple[float, float, float],
+    gap: tuple[Array, Array, Array],
+    known: Mask,
+    counts: Indices,
+) -> int:
+    """Move the chosen pegs towards their targets, of (N, 3), until they are there or at rest.
+
+    `peg` and `gap` (N, 1) are set, `known`, and how often each was measured. It returns what `measured` does.
+    """
+    searched = 0
+    normals, offsets, seen = np.empty((_PLANES, 3)), np.empty(_PLANES), np.empty((_PLANES, 3))
+    active, normal, best = np.empty(_PLANES, np.bool_), np.empty(3), np.empty(3)
+    for k in range(len(chosen)):
+        n = chosen[k]
+        normals[:], offsets[:], seen[:] = 0.0, 0.0, np.inf
+        place, planes = peg.translation[n, 0], (normals, offsets, seen)
         for iteration in range(_ITERATIONS):
-            peg = Frames(turn[moving, None], place[moving, None])
-            gap, _, normal = model.gap.evaluate(Frames(*(each[moving] for each in part)), peg)
-            distance[moving] = gap[:, 0]
-            at_rest = np.zeros(len(moving), dtype=np.bool_)
-            _step(
-                moving,
-                place,
-                target,
-                gap[:, 0],
-                np.einsum("nij,nj->ni", part.rotation[moving], normal[:, 0]),
-                normals,
-                offsets,
-                seen,
-                model.step,
-                model.friction,
-                model.pressed,
-                _CONVERGED if iteration < _PATIENT else _ROUGHLY,
-                at_rest,
-            )
-            moving = moving[~at_rest]
-            if len(moving) == 0:
+            if not known[n]:
+                searched += measured(n, n + 1, part, peg, tables, *gap)
+                counts[k] += 1
+            for axis in range(3):
+                normal[axis] = dot(part.rotation[n, axis], gap[2][n, 0])
+            converged = _CONVERGED if iteration < _PATIENT else _ROUGHLY
+            known[n] = _step(place, target[n], gap[0][n, 0], normal, planes, limits, converged, active, best)
+            if known[n]:
                 break
-        return torch.from_numpy(place), torch.from_numpy(distance)
+    return searched
 
 
 @compiled
 def _step(
-    moving: Indices,
     place: Array,
     target: Array,
-    distance: Array,
+    distance: float,
     normal: Array,
-    normals: Array,
-    offsets: Array,
-    seen: Array,
-    longest: float,
-    friction: float,
-    pressed: float,
+    remembered: tuple[Array, Array, Array],
+    limits: tuple[float, float, float],
     converged: float,
-    at_rest: Mask,
-) -> None:
-    """Move each peg by one step: out of the part where it penetrates it, otherwise towards its target."""
-    planes = normals.shape[1]
-    active = np.zeros(planes, np.bool_)
-    for k in range(len(moving)):
-        m, slot, least, same = moving[k], 0, np.inf, False
-        for p in range(planes):
-            # A plane approximates the part near where it was seen; a gap wider than it allows refutes it.
-            active[p] = ((place[m] - seen[m, p]) ** 2).sum() < 4.0 * longest * longest
-            active[p] &= (normals[m, p] * place[m]).sum() - offsets[m, p] > distance[k] - _REFUTED
-            # The newest replaces one like it, an inactive one, or the least tight.
-            tight = -np.inf
-            if active[p]:
-                tight = offsets[m, p] - (normals[m, p] * place[m]).sum()
-                if (normals[m, p] * normal[k]).sum() > _ALIKE:
-                    slot, same = p, True
-            if not same and tight < least:
-                slot, least = p, tight
-        normals[m, slot], seen[m, slot], active[slot] = normal[k], place[m], True
-        offsets[m, slot] = (normal[k] * place[m]).sum() - distance[k]
-        inside = distance[k] < -0.2 * converged
-        best = project_onto_half_spaces(place[m] if inside else target[m], normals[m], offsets[m], active)
-        step = best - place[m]
-        size = np.sqrt((step * step).sum())
-        if not inside and friction > 0.0 and distance[k] < _TOUCHES:
-            # The command draws the peg no farther than the rim of the friction cone.
-            held = friction * min(np.sqrt(((target[m] - best) ** 2).sum()), pressed)
-            step *= max(0.0, size - held) / max(size, 1e-300)
-            size = max(0.0, size - held)
-        if not inside and size > longest:
-            step *= longest / size
-        at_rest[k] = not inside and size <= converged
-        if not at_rest[k]:
-            place[m] += step
+    active: Mask,
+    best: Array,
+) -> bool:
+    """Move a peg by one step: out of the part where it penetrates it, otherwise towards its target.
+
+    `active` and `best` are room for that. True, and no step, where it is at rest.
+    """
+    normals, offsets, seen = remembered
+    longest, friction, pressed = limits
+    slot, least, same = 0, np.inf, False
+    for p in range(len(offsets)):
+        # A plane approximates the part near where it was seen; a gap wider than it allows refutes it.
+        above = dot(normals[p], place) - offsets[p]
+        active[p] = _apart(place, seen[p]) < 2.0 * longest and above > distance - _REFUTED
+        # The newest replaces one like it, an inactive one, or the least tight.
+        tight = -np.inf
+        if active[p]:
+            tight = -above
+            if dot(normals[p], normal) > _ALIKE:
+                slot, same = p, True
+        if not same and tight < least:
+            slot, least = p, tight
+    normals[slot], seen[slot], active[slot] = normal, place, True
+    offsets[slot] = dot(normal, place) - distance
+    inside = distance < -0.2 * converged
+    project_onto_half_spaces(place if inside else target, normals, offsets, active, best)
+    size = _apart(best, place)
+    share = 1.0
+    if not inside and friction > 0.0 and distance < _TOUCHES:
+        # The command draws the peg no farther than the rim of the friction cone.
+        held = friction * min(_apart(target, best), pressed)
+        share = max(0.0, size - held) / max(size, 1e-300)
+        size = max(0.0, size - held)
+    if not inside and size > longest:
+        share *= longest / size
+    if not inside and size <= converged:
+        return True
+    for axis in range(3):
+        place[axis] += share * (best[axis] - place[axis])
+    return False
+
+
+@compiled
+def _apart(first: Array, second: Array) -> float:
+    """The distance of two points (3,)."""
+    return np.sqrt((first[0] - second[0]) ** 2 + (first[1] - second[1]) ** 2 + (first[2] - second[2]) ** 2)
 
 
 def _thickness(part: Part) -> float:

@@ -73,6 +73,26 @@ def test_a_peg_lowered_on_a_plane_stops_at_it_however_far_apart_the_stamps(count
     )
 
 
+def test_a_held_peg_is_measured_once_and_one_that_turns_again() -> None:
+    rules = QuasiStaticMotion(PegGap(block((0.06, 0.06, 0.025)), box_peg(0.016, LENGTH)))
+    command = way((0, 0, 0.002), (0, 0, -0.004))
+    held = torch.cat([command, command[-1:].expand(30, 7)])
+    costs = []
+    for each in (command, held):
+        before = rules.gap.effort.copy()
+        motion = rules(poses.identity(1), each)
+        costs.append(rules.gap.effort.since(before).items)
+    assert costs[0] == costs[1] > 0
+    assert bool((motion[0, len(command) :] == motion[0, len(command) - 1]).all())
+    # Turned where it stands it rests on an edge, which is farther from its grip than the flat end.
+    angle = 0.1
+    turning = held[-2:].clone()
+    turning[1, 3:] = turned(angle, 0.0, 0.0)[0, 3:]
+    height = rules(poses.identity(1), turning)[0, :, 2]
+    edge = LENGTH * math.cos(angle) + 0.008 * math.sin(angle)
+    np.testing.assert_allclose(height.numpy(), [LENGTH, edge], atol=1e-6)
+
+
 def test_on_a_tilted_face_it_slides_to_where_the_spring_is_shortest() -> None:
     tilt = 0.1
     command = way((0, 0, 0.005), (0, 0, -0.004), (0.01, 0, -0.004))

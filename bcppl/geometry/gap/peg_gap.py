@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -10,15 +11,16 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.arrays import Array
+from bcppl.compiled import compiled
 from bcppl.devices import is_on_host
 from bcppl.effort import Effort
 from bcppl.errors import InputError
-from bcppl.geometry.distance import SignedDistance
-from bcppl.geometry.gap.distance_grid import RefinedGrid, distance_grid
+from bcppl.geometry.distance import SignedDistance, Surface
+from bcppl.geometry.gap.distance_grid import DistanceGrid, RefinedGrid, distance_grid
 from bcppl.geometry.gap.edges import by_edges
 from bcppl.geometry.gap.frames import Frames, frames_of
-from bcppl.geometry.gap.sharp_edges import sharp_edges
-from bcppl.geometry.gap.solids import solids_of
+from bcppl.geometry.gap.sharp_edges import SharpEdges, sharp_edges
+from bcppl.geometry.gap.solids import Solids, solids_of
 from bcppl.geometry.gap.vertices import NEAR, by_vertices
 from bcppl.geometry.parts import Part
 from bcppl.threads import parallel_sum, thread_count
@@ -29,6 +31,37 @@ if TYPE_CHECKING:
 MARGIN = 0.012  # m around the part that the grid covers
 _CHUNK = 8  # particles of a chunk of work, at least
 _PAIRS = 2000  # pairs of poses of a chunk, at least: they take milliseconds, and to wake a thread a tenth
+
+
+class Tables(NamedTuple):
+    """What `measured` looks up: the part's grid of distances, surface and sharp edges, the peg's solids."""
+
+    grid: DistanceGrid
+    surface: Surface
+    edges: SharpEdges
+    solids: Solids
+
+
+@compiled
+def measured(
+    first: int,
+    last: int,
+    part: Frames,
+    peg: Frames,
+    tables: Tables,
+    distance: Array,
+    witness: Array,
+    normal: Array,
+) -> int:
+    """Set the fields of `Gap`, of particles from `first` to `last`, at frames (N,) and (1 or N, T).
+
+    Returns:
+        how many exact distances were searched for.
+    """
+    grid, surface, edges, solids = tables
+    searched = by_vertices(first, last, part, peg, grid, surface, solids, distance, witness, normal)
+    by_edges(first, last, part, peg, edges, solids, distance, witness, normal)
+    return searched
 
 
 class Gap(NamedTuple):
@@ -114,22 +147,25 @@ class PegGap:
         """The fields of `Gap` as arrays, at frames (N,) of the part and (T,) or (N, T) of the peg."""
         peg = peg if peg.translation.ndim == 3 else Frames(peg.rotation[None], peg.translation[None])
         particles, stamps = len(part.translation), peg.translation.shape[1]
+        distance = np.empty((particles, stamps))
+        witness, normal = np.empty((particles, stamps, 3)), np.empty((particles, stamps, 3))
+
+        def work(first: int, last: int, tables: Tables) -> int:
+            return measured(first, last, part, peg, tables, distance, witness, normal)
+
         with self.effort.measure(items=particles * stamps):
-            if self._grid is None:
-                self._grid = RefinedGrid(distance_grid(self.part, self._signed, MARGIN), self._signed, NEAR)
-            distance = np.empty((particles, stamps))
-            witness, normal = np.empty((particles, stamps, 3)), np.empty((particles, stamps, 3))
-            result, grid, surface = (distance, witness, normal), self._grid.grid, self._signed.surface
-            chunk = max(_CHUNK, _PAIRS // max(1, stamps))
-
-            def of_vertices(first: int, last: int) -> int:
-                return by_vertices(first, last, part, peg, grid, surface, self._solids, *result)
-
-            def of_edges(first: int, last: int) -> int:
-                by_edges(first, last, part, peg, self._edges, self._solids, *result)
-                return 0
-
-            searched = parallel_sum(of_vertices, 0, particles, chunk, thread_count())
-            parallel_sum(of_edges, 0, particles, chunk, thread_count())
-            self._grid.refine(searched)
+            self.in_threads(work, particles, max(_CHUNK, _PAIRS // max(1, stamps)))
         return distance, witness, normal
+
+    def in_threads(self, work: Callable[[int, int, Tables], int], particles: int, chunk: int) -> None:
+        """Call `work` on chunks of particles, the first and the one after the last of each.
+
+        It measures by `measured`, and returns what that does.
+        """
+        if self._grid is None:
+            self._grid = RefinedGrid(distance_grid(self.part, self._signed, MARGIN), self._signed, NEAR)
+        tables = Tables(self._grid.grid, self._signed.surface, self._edges, self._solids)
+        searched = parallel_sum(
+            lambda first, last: work(first, last, tables), 0, particles, chunk, thread_count()
+        )
+        self._grid.refine(searched)

@@ -16,10 +16,9 @@ from torch import Tensor
 
 from bcppl import poses, warp_arrays
 from bcppl.arrays import Array
-from bcppl.devices import numbers, on_device_of
+from bcppl.devices import on_device_of
 from bcppl.geometry.distance import closed_mesh
 from bcppl.geometry.gap.distance_grid import RefinedGrid, distance_grid
-from bcppl.geometry.gap.frames import Frames
 from bcppl.geometry.gap.peg_gap import MARGIN, Gap, PegGap
 from bcppl.geometry.gap.sharp_edges import CANCELLED
 from bcppl.geometry.gap.vertices import FADING, NEAR
@@ -217,15 +216,6 @@ class WarpGap(PegGap):
             distance, witness, normal = self._launch(turns[0], part[:, :3], turns[1], peg[..., :3])
             found = (distance.double(), witness.double() + self._middle, normal.double())
         return Gap(*(on_device_of(each, world_from_part) for each in found))
-
-    def evaluate(self, part: Frames, peg: Frames) -> tuple[Array, Array, Array]:
-        """The fields of `Gap` as arrays, at frames (N,) of the part and (T,) or (N, T) of the peg."""
-        peg = peg if peg.translation.ndim == 3 else Frames(peg.rotation[None], peg.translation[None])
-        device = warp_arrays.torch_device(self.device)
-        with self.effort.measure(items=len(part.translation) * peg.translation.shape[1]):
-            given = (torch.from_numpy(np.ascontiguousarray(each)).to(device) for each in (*part, *peg))
-            distance, witness, normal = (numbers(each.double()) for each in self._launch(*given))
-        return distance, witness + self._center, normal
 
     def _launch(self, *frames: Tensor) -> list[Tensor]:
         """Distances (N, T), witness points about the mesh's centre and normals, in single precision.
