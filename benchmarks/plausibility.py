@@ -127,6 +127,16 @@ def wrench_scaled(force: float, torque: float) -> Callable[[Recording], Recordin
     return lambda recording: touches_changed(recording, lambda wrench, pose: (wrench * scale, pose))
 
 
+def about_sensor(recording: Recording) -> Recording:
+    """The torques are about an origin 60 mm above the peg's."""
+
+    def wrong(wrench: Array, pose: Array) -> tuple[Array, Array]:
+        moved = wrench[:, 3:] - np.cross([0.0, 0.0, 0.06], wrench[:, :3])
+        return np.hstack([wrench[:, :3], moved]), pose
+
+    return touches_changed(recording, wrong)
+
+
 def displaced(recording: Recording) -> Recording:
     """The peg's poses are those of another world, a decimetre beside."""
     beside = np.array([0.1, 0.05, 0.0, 0.0, 0.0, 0.0, 0.0])
@@ -194,6 +204,9 @@ MISTAKES: Mapping[str, Mistake] = {
     "forces and torques in mN": Mistake(
         wrench_scaled(1e3, 1e3), "millinewtons, scale them by 0.001, and torques"
     ),
+    "torques of the wrong sign": Mistake(wrench_scaled(1.0, -1.0), "take -torque"),
+    "torques of zero": Mistake(wrench_scaled(1.0, 0.0), "torques that are all zero"),
+    "torques about the sensor": Mistake(about_sensor, "about the sensor's origin"),
     "forces of the wrong sign": Mistake(forces_reversed, "take -wrench"),
     "peg 100 mm beside": Mistake(displaced, "wherever that is within the guess"),
     "command never changes": Mistake(command_still, "a command that never changes"),

@@ -29,6 +29,7 @@ from bcppl.models.worlds.simulated_sensors import windows
 from bcppl.recordings import Recording, problems, save
 from bcppl.robot.motion import Probe
 from bcppl.sensors.plausibility import doubts
+from bcppl.sensors.plausibility.torques import torque_doubt
 from tests.made_recordings import assert_one_sentence, full
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
@@ -82,6 +83,26 @@ def test_a_right_recording_of_a_bench_without_errors_gives_no_doubt() -> None:
 @pytest.mark.parametrize("name", ["peg_probe", "point_probe_10_pushes"])
 def test_a_shipped_recording_gives_no_doubt(name: str) -> None:
     assert doubts(load_recording(name)) == []
+
+
+def test_torques_are_compared_with_those_of_the_forces_at_the_contacts() -> None:
+    generator = np.random.default_rng(0)
+    place = np.array([0.0, 0.0, -0.07]) + generator.uniform(-0.008, 0.008, (40, 3))
+    force = generator.normal(size=(40, 3)) * [2.0, 2.0, 6.0]
+
+    def doubt(torque: np.ndarray) -> str:
+        noise = 0.01 * generator.normal(size=(40, 3))
+        return " ".join(torque_doubt(np.hstack([force, torque + noise * (torque != 0.0)]), place))
+
+    assert doubt(np.cross(place, force)) == ""
+    assert doubt(np.cross(place + 0.01, force)) == ""  # another place on the peg
+    assert "take -torque" in doubt(-np.cross(place, force))
+    assert "all zero" in doubt(np.zeros((40, 3)))
+    found = re.search(r"point \((.*), (.*), (.*)\) mm", doubt(np.cross(place - [0.0, 0.0, 0.05], force)))
+    assert found is not None
+    np.testing.assert_allclose([float(each) for each in found.groups()], [0.0, 0.0, 50.0], atol=3.0)
+    # Forces through the peg's origin exert none.
+    assert " ".join(torque_doubt(np.hstack([force, np.zeros((40, 3))]), 0.01 * force / 6.0)) == ""
 
 
 def test_a_recording_of_a_few_pixels_is_not_judged() -> None:

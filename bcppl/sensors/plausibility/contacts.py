@@ -103,12 +103,14 @@ class Met:
         share: of the largest score: 1 where each contact is at the surface and no free peg in the part.
         gap: (T,) of all stamps of all probes there, m.
         normal: (T, 3) of the part, in the world's axes.
+        place: (T, 3) of the part that is closest to the peg, in the peg's frame, m.
     """
 
     found: Found
     share: float
     gap: Array
     normal: Array
+    place: Array
 
 
 class Contacts:
@@ -165,10 +167,12 @@ class Contacts:
         )
         pose = torch.from_numpy(np.concatenate([felt.pose for felt in probes]))
         gap = self._gap(torch.from_numpy(found.pose)[None], pose)
-        turn = poses.rotation_matrix(torch.from_numpy(found.pose)).numpy()
+        part = torch.from_numpy(found.pose)
+        turn = poses.rotation_matrix(part).numpy()
+        place = poses.transform(poses.compose(poses.inverse(pose), part), gap.witness[0][:, None])[:, 0]
         score = float(self.score(probes, found.pose[None], directed=False)[0])
         share = score / max(self.most(probes), 1e-9)
-        return Met(found, share, gap.distance[0].numpy(), gap.normal[0].numpy() @ turn.T)
+        return Met(found, share, gap.distance[0].numpy(), gap.normal[0].numpy() @ turn.T, place.numpy())
 
 
 def along_axis(felt: Felt, metres: float) -> Felt:

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from bcppl import poses
-from bcppl.arrays import Array
+from bcppl.arrays import Array, Mask
 from bcppl.contact.touch import Touch
 from bcppl.errors import InputError
 from bcppl.geometry.parts import Guess, Part
@@ -20,6 +20,7 @@ from bcppl.sensors.plausibility.contacts import Contacts, Felt, Met, along_axis,
 from bcppl.sensors.plausibility.images import reordered
 from bcppl.sensors.plausibility.pegs import peg_doubt
 from bcppl.sensors.plausibility.search import Found, is_narrow
+from bcppl.sensors.plausibility.torques import torque_doubt
 from bcppl.sensors.plausibility.units import FEWEST, command_doubt, in_newtons, zero_doubt
 from bcppl.sensors.plausibility.wording import of_probes
 
@@ -133,6 +134,10 @@ def _of_contacts(contacts: Contacts, probes: Sequence[Felt], start: Found | None
             f"{best.cosine:.2f}): probably the wrench is not in the peg's frame; turn it there."
         )
         return
+    near = _near(probes, best.met)
+    if best is stated and near.sum() >= FEWEST:
+        wrench = np.concatenate([felt.wrench for felt in probes])
+        yield from (f"{who} has {words}." for words in torque_doubt(wrench[near], best.met.place[near]))
     if start is not None:  # touches alone leave room for a part that suits another clock
         yield from _clock(contacts, best, who, start)
 
@@ -145,12 +150,17 @@ def judged(contacts: Contacts, hypothesis: Hypothesis, start: Found | None) -> J
 
 def _cosine(probes: Sequence[Felt], met: Met) -> float:
     """The mean cosine of the force and the part's normal, of contacts at the part; 0 where there are none."""
-    force = np.concatenate([felt.force for felt in probes])
-    near = np.concatenate([felt.contact for felt in probes]) & (np.abs(met.gap) < TOUCHING)
+    force, near = np.concatenate([felt.force for felt in probes]), _near(probes, met)
     if near.sum() < FEWEST:
         return 0.0
     size = np.linalg.norm(force[near], axis=1)
     return float(np.mean((force[near] * met.normal[near]).sum(axis=1) / size))
+
+
+def _near(probes: Sequence[Felt], met: Met) -> Mask:
+    """Whether (T,) a contact is at the part."""
+    contact = np.concatenate([felt.contact for felt in probes])
+    return np.asarray(contact & (np.abs(met.gap) < TOUCHING))
 
 
 def _hypotheses(contacts: Contacts, stated: Judged, start: Found | None) -> Iterator[Hypothesis]:
