@@ -188,6 +188,7 @@ MISTAKES: Mapping[str, Mistake] = {
     "one camera of OpenGL": Mistake(posed(opengl, 0), "'camera_0' shows no part where the guess has one"),
     "camera poses inverted": Mistake(posed(inverted), "world_from_camera is inverted"),
     "hand-eye inverted": Mistake(hand_eye_inverted, "hand-eye calibration is inverted"),
+    "images upside down": Mistake(viewed(lambda _, depth: ({}, depth[::-1, ::-1])), "upside down"),
     "focal length halved": Mistake(focal(0.5), "about 2 times the stated"),
     "focal length doubled": Mistake(focal(2.0), "about 0.5 times the stated"),
     "focal length times 1.3": Mistake(focal(1.3), "about 0.8 times the stated"),

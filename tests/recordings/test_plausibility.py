@@ -61,6 +61,18 @@ def test_a_mistake_is_named_once_and_with_its_cause(name: str) -> None:
     assert_one_sentence(found)
 
 
+def test_images_that_are_upside_down_or_mirrored_are_named() -> None:
+    recording = plausibility.windows_left_out(right(0, True))
+    for order, words in (
+        (np.s_[::-1, ::-1], "turn it by half a turn"),
+        (np.s_[:, ::-1], "rows are mirrored"),
+    ):
+        wrong = plausibility.viewed(lambda _, depth, order=order: ({}, depth[order]))(recording)
+        (found,) = doubts(wrong)
+        assert words in found
+        assert_one_sentence(found)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("millimetres", [80, 120])
 def test_how_far_along_its_axis_a_peg_is_off_is_named_where_its_sides_touch(millimetres: int) -> None:

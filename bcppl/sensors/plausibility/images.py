@@ -128,6 +128,11 @@ def _scaled(factor: float) -> Callable[[Seen], Seen | None]:
     return lambda seen: Seen(seen.camera, factor * seen.depth)
 
 
+def _read(order: tuple[slice, slice]) -> Callable[[Seen], Seen | None]:
+    """A repair of the order of pixels."""
+    return lambda seen: Seen(seen.camera, seen.depth[order])
+
+
 def _focal(factor: float) -> Callable[[Seen], Seen | None]:
     def made(seen: Seen) -> Seen | None:
         camera = seen.camera
@@ -183,6 +188,8 @@ def repairs() -> Iterator[Repair]:
         with_pose(_hand_eye),
         "the hand-eye calibration is inverted, camera_from_wrist: compose the wrist's pose with its inverse",
     )
+    yield Repair("mirrored", _read(np.s_[:, ::-1]), "its rows are mirrored: read them from right to left")
+    yield Repair("upside down", _read(np.s_[::-1, ::-1]), "the image is upside down: turn it by half a turn")
     for factor in (0.5, 0.67, 0.8, 1.25, 1.5, 2.0):
         yield Repair(
             f"focal length {factor:g}",

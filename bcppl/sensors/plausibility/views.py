@@ -65,7 +65,8 @@ def _doubts(images: Images, several: Sequence[Seen], all_of_them: bool) -> tuple
         whole = whole if whole[1].score > BETTER * stated.score else None
     if whole is not None:
         who = "the views" if all_of_them else f"the {len(several)} views that were looked at"
-        seen_as = "no part where the guess has one" if stated.share < POOR else "the part at another size"
+        seen_as = "the part poorly" if whole[0].factor == 1.0 else "the part at another size"
+        seen_as = "no part where the guess has one" if stated.share < POOR else seen_as
         return [f"{who} show {seen_as}, but would fit it if {whole[0].words}."], whole[1].found
     if min(images.shares(several, stated.found)) >= POOR:
         return [], stated.found
