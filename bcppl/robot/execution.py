@@ -202,8 +202,10 @@ class Executor:
             return ""
         later = self.probe.command_times >= after - 1e-9
         times, path = self.probe.command_times[later], self.probe.command[later]
-        of = np.searchsorted(self.plan.times, times[1:] - 1e-9, side="right") - 1
-        free = np.array([float(manner == "free") for manner in self.plan.manners])[of]
+        # By their middles: a clock that counts from 1970 resolves no nanosecond. The last may end later.
+        amid = np.searchsorted(self.plan.times, 0.5 * (times[1:] + times[:-1]), side="right") - 1
+        manners = np.array([float(manner == "free") for manner in self.plan.manners])
+        free = manners[np.minimum(amid, len(manners) - 1)]
         # Corners are rounded: the end of a free motion is led at the beginning of the next.
         free = np.convolve(free, np.ones(ROUNDED + 1))[: len(free)]
         limit = np.where(free > 0.0, self.limits.free_speed, self.limits.speed)

@@ -107,7 +107,7 @@ def driven_joints(robot: Robot) -> Iterator[Driven]:
     joints = {joint.name: joint for joint in map(robot.joint_to, robot.links[1:]) if joint.kind in MOVING}
     for joint in joints.values():
         driver, factor, constant = joint, 1.0, 0.0
-        while driver.mimics is not None:
+        while driver.mimics is not None and driver.name not in robot.held:
             name, multiplier, offset = driver.mimics
             driver, factor, constant = joints[name], factor * multiplier, constant + factor * offset
         if driver.name in number:

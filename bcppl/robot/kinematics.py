@@ -34,6 +34,7 @@ class Robot:
         joints: the J independent joints, from the base outwards. Joints that mimic another are not among
             them, nor are fixed ones: those outside the chain from the base to `tip`, and those in `held`.
         links: names of all links, the base first.
+        held: values of the joints that were given one, by name.
     """
 
     def __init__(
@@ -67,7 +68,7 @@ class Robot:
         self.name = self._description.name
         self.links = self._description.links
         moving = {j.name: j for j in self._description.joints if j.kind in MOVING}
-        held = held_values(self.name, moving, {} if held is None else held)
+        self.held = held = held_values(self.name, moving, {} if held is None else held)
         for joint in moving.values():
             if joint.mimics is not None and joint.mimics[0] not in moving:
                 raise InputError(

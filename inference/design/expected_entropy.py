@@ -139,5 +139,7 @@ def expected_information_gain(
 def _after_both(first: Utility, second: SecondStep) -> Utility:
     gains = first.gains + second.gains
     gain, error = mean_and_error(gains, first.weights)
-    cost, _ = mean_and_error(second.costs, first.weights)
+    # Where the simulation failed, no second step was chosen.
+    costs = torch.where(torch.isnan(gains), torch.nan, second.costs)
+    cost, _ = mean_and_error(costs, first.weights)
     return first.with_second_step(gains, gain, math.hypot(error, second.standard_error), cost, second.numbers)

@@ -15,7 +15,7 @@ from bcppl.errors import InputError
 from bcppl.geometry.gap import PegGap
 from bcppl.geometry.parts import Part
 from bcppl.inference.planning.constraints import Constraint, per_candidate
-from bcppl.inference.planning.motions import expected_contacts, free_path, pressing_force
+from bcppl.inference.planning.motions import expected_contacts, free_path, pressing_force, whole_path
 from bcppl.robot.arm_with_peg import ArmWithPeg
 from bcppl.robot.commands import interpolated_command
 from bcppl.robot.inverse_kinematics import joint_paths
@@ -68,7 +68,7 @@ def not_from_below() -> Constraint:
         motion = motion_of(candidate)
         if motion is None:
             return True
-        up = poses.rotation_matrix(torch.from_numpy(motion.world_from_peg))[:, 2, 2]
+        up = poses.rotation_matrix(torch.from_numpy(whole_path(motion)))[:, 2, 2]
         return bool((up > math.cos(_FROM_BELOW) - 1e-9).all())
 
     def satisfied(candidates: Sequence[Candidate]) -> list[bool]:
@@ -128,7 +128,7 @@ def above_table(peg: Part | None, height: float, margin: float = 0.002) -> Const
             return False
         if motion is None:
             return True
-        lowest = poses.transform(torch.from_numpy(motion.world_from_peg), corners)[..., 2].min()
+        lowest = poses.transform(torch.from_numpy(whole_path(motion)), corners)[..., 2].min()
         return bool(lowest > height + margin)
 
     return per_candidate("lead into the table", satisfies)

@@ -73,6 +73,13 @@ def free_path(plan: Plan) -> Array:
     return np.concatenate(path)
 
 
+def whole_path(plan: Plan) -> Array:
+    """Poses (M, 7) of the commanded peg all along a plan: at the ends of straight motions, amid turns too."""
+    knots = plan.world_from_peg
+    turns = [k for k in range(len(knots) - 1) if (knots[k, 3:] != knots[k + 1, 3:]).any()]
+    return np.concatenate([knots, *(_interpolate(knots[k], knots[k + 1]) for k in turns)])
+
+
 def _interpolate(start: Array, stop: Array) -> Array:
     """Poses (M, 7) on the straight motion between two."""
     ends = Rotation.from_quat(np.stack([start, stop])[:, [4, 5, 6, 3]])

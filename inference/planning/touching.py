@@ -280,7 +280,9 @@ def _contact(
         top, bottom = top_of(part), float(part.vertices[:, 2].min())
         uncertainty = half_stroke(belief, np.array([0.0, 0.0, top]), UP, parameters)
         highest = max(top - uncertainty - parameters.side_depth, 0.5 * (top + bottom))
-        position[2] = min(position[2], highest)
+        lower = max(position[2] - highest, 0.0)
+        uphill = UP - point.normal[2] * point.normal  # along the face, which may slope
+        position -= lower / uphill[2] * uphill
     return position - leading_point(peg, -point.normal)
 
 

@@ -206,6 +206,16 @@ def test_what_follows_a_stop_keeps_to_the_limits_too() -> None:
     assert executor.commanded()[2] == pytest.approx(-0.01)
 
 
+@pytest.mark.parametrize("begins", [0.0, 1.7e9])
+@pytest.mark.parametrize("longer", [0.0, 0.002, 0.003, 0.004])
+def test_the_limits_after_a_stop_suit_a_plan_of_any_length_and_clock(longer: float, begins: float) -> None:
+    plan = descent()
+    times = begins + plan.times + [0.0, 0.0, 0.0, longer]
+    executor = Executor(replace(plan, times=times), limits=Limits())
+    executed(executor, wall=-0.01)
+    assert executor.state == "finished" and executor.contact_pose is not None
+
+
 def test_a_plan_that_turns_too_fast_is_refused() -> None:
     turned = descent().world_from_peg.copy()
     turned[3, 3:] = 0.0, 0.0, 0.0, 1.0

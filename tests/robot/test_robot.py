@@ -178,6 +178,14 @@ def test_paths_are_within_the_limits_of_mimicking_joints(tmp_path: Path) -> None
         joint_paths(Robot(tmp_path / "geared.urdf", tip="tip"), "tip", poses.identity(1)[None].numpy())
 
 
+def test_a_joint_that_is_held_follows_and_limits_no_other(tmp_path: Path) -> None:
+    (tmp_path / "geared.urdf").write_text(FOLLOWED.replace("LOWER", "-1"))
+    geared = Robot(tmp_path / "geared.urdf", tip="tip", held={"elbow": 0.0})
+    angles = torch.tensor([[-0.6], [1.5]], dtype=torch.float64)
+    paths = joint_paths(geared, "tip", geared.base_from_link("tip", angles)[:, None].numpy())[:, 0]
+    np.testing.assert_allclose(paths, angles.numpy(), atol=0.01)
+
+
 def test_a_wrist_camera_moves_with_the_wrist(robot: Robot) -> None:
     angles = postures(robot, 4)
     wrist_from_camera = poses.as_pose([0.05, 0.0, 0.03, 0.0, 1.0, 0.0, 0.0])

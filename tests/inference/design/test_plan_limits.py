@@ -11,7 +11,9 @@ import pytest
 from bcppl.arguments import pose_problem
 from bcppl.cli.candidates import planned
 from bcppl.errors import InputError
+from bcppl.geometry.extrusion import round_peg
 from bcppl.inference.planning.metrology import MetrologyParameters, three_two_one
+from bcppl.inference.planning.motion_constraints import above_table, not_from_below
 from bcppl.inference.planning.motions import free_path, pressing_force
 from bcppl.models.worlds.bench.scene import bench_scene
 from bcppl.robot.plan import Manner, Plan
@@ -40,6 +42,23 @@ def test_a_way_that_only_turns_is_looked_at_between_its_ends() -> None:
     path = free_path(replace(plan, world_from_peg=turned))
     cosines = np.abs(np.sum(path[1:, 3:] * path[:-1, 3:], axis=1)).clip(0.0, 1.0)
     assert np.degrees(2.0 * np.arccos(cosines)).max() < 2.01 and len(path) > 90
+
+
+def turning(degrees: float) -> Plan:
+    """A peg whose origin stays while it turns about x, as far to the one side as to the other."""
+    plan = led(0.0, 0.0, manner="free")
+    knots = plan.world_from_peg.copy()
+    for k, sign in enumerate((-1.0, -1.0, 1.0)):
+        half = 0.5 * sign * np.radians(degrees)
+        knots[k, 3:] = np.cos(half), np.sin(half), 0.0, 0.0
+    return replace(plan, world_from_peg=knots)
+
+
+def test_a_turning_peg_is_held_above_the_table_and_from_above_amid_its_turn() -> None:
+    peg = round_peg(0.01, 0.1)  # amid the turn it is upright, its tip 0.1 m below its origin
+    assert list(above_table(peg, -0.11).satisfied([turning(60.0)])) == [True]
+    assert list(above_table(peg, -0.07).satisfied([turning(60.0)])) == [False]
+    assert list(not_from_below().satisfied([turning(60.0), turning(110.0)])) == [True, False]
 
 
 @pytest.mark.parametrize(

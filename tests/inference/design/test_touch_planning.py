@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import shapely
 import torch
+import trimesh
 
 from bcppl import poses
 from bcppl.beliefs import Belief
@@ -17,8 +18,11 @@ from bcppl.contact.sensing.contact_detection import ContactDetector
 from bcppl.errors import InputError
 from bcppl.geometry.extrusion import block, block_with_square_hole, box_peg, extruded, round_peg
 from bcppl.geometry.gap import PegGap
+from bcppl.geometry.parts import Part
 from bcppl.inference.planning.faces import boundary_points, points_on_top, section, sides
 from bcppl.inference.planning.metrology import ROCKED, MetrologyParameters, three_two_one
+from bcppl.inference.planning.motions import expected_contacts
+from bcppl.inference.planning.touching import SurfacePoint, touch
 from bcppl.models.parts import insert_peg, insert_tray
 from bcppl.models.worlds.bench.scene import BenchScene, bench_scene
 from bcppl.models.worlds.guarded_motion import Execution
@@ -292,6 +296,23 @@ def test_a_rocked_peg_leans_and_turns_both_ways_about_its_tip_and_stays_in_conta
     for k in torch.nonzero(leaning)[:, 0].tolist():
         during = (stamps > plan.times[k - 1]) & (stamps < plan.times[k])
         assert float(gap[torch.from_numpy(during)].max()) < 2e-4
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.3, 0.45, -0.3])
+def test_a_touch_of_a_side_that_slopes_is_made_at_that_side(slope: float) -> None:
+    normal = np.array([math.sqrt(1.0 - slope**2), 0.0, slope])
+    wider = 0.03 * slope / normal[0]
+    corners = [
+        [x * w, y * w, z] for w, z in ((0.02, 0.0), (0.02 + wider, -0.03)) for x in (-1, 1) for y in (-1, 1)
+    ]
+    hull = trimesh.convex.convex_hull(np.array(corners))
+    frustum = Part("frustum", np.array(hull.vertices), np.array(hull.faces), source="a test")
+    place = SurfacePoint(np.array([0.02 + 0.002 * slope / normal[0], 0.0, -0.002]), normal)
+    about_here = Belief(poses.identity(2), torch.zeros(2, dtype=torch.float64))
+    peg = round_peg(0.01, 0.1)
+    (pose, _), *_ = expected_contacts(touch(about_here, frustum, peg, place))
+    gap = (peg.vertices + pose[:3] - place.position) @ normal
+    assert gap.min() == pytest.approx(0.0, abs=1e-9)
 
 
 @pytest.mark.parametrize("size", [0.25, 0.5])
