@@ -106,12 +106,16 @@ class Calibration:
         Raises:
             InputError: there is no such quantity.
         """
-        levels = self.levels(quantity)
-        if quantity == DENSITY:
-            levels = 1.0 - levels
-        elif quantity != DISTANCE:
-            levels = np.abs(2.0 * levels - 1.0)
-        return np.array([np.mean(levels < mass) for mass in masses])
+        levels, half = self.levels(quantity), 0.5 / (self.posterior_draws + 1.0)
+        shares = []
+        for mass in masses:
+            low, high = 0.5 - 0.5 * mass, 0.5 + 0.5 * mass
+            if quantity in (DENSITY, DISTANCE):
+                low, high = (1.0 - mass, 1.0) if quantity == DENSITY else (0.0, mass)
+            # A rank is known to lie between two draws, and counts by the share of that range.
+            within = np.minimum(high, levels + half) - np.maximum(low, levels - half)
+            shares.append(np.mean(within.clip(min=0.0)) / (2.0 * half))
+        return np.array(shares)
 
     @cached_property
     def averaged(self) -> dict[str, Averaged]:

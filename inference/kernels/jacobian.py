@@ -249,8 +249,14 @@ def refuse_leaving(address: str, chart: Chart, old: Tensor, new: Tensor) -> None
 
 def refuse_apart(what: str, first: Point, second: Mapping[Key, Tensor]) -> None:
     """Refuse a move and its reverse that do not end where they began."""
+    real = [value for value, _ in first.values() if value.is_floating_point()]
+    limit = torch.tensor(1e-6, dtype=torch.float64)
+    for value in real:
+        # Rounding is of the largest value that takes part.
+        size = 1.0 + value.detach().abs().reshape(len(value), -1).amax(dim=1).double()
+        limit = torch.maximum(limit, (16.0 * torch.finfo(value.dtype).eps * size).clamp(max=0.5))
     for (kind, address), (value, chart) in first.items():
-        apart = ~(chart.apart(value, second[kind, address]) <= 1e-6)
+        apart = ~(chart.apart(value, second[kind, address]) <= limit)
         if bool(apart.any()):
             particle = int(apart.nonzero()[0])
             raise InputError(

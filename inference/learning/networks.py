@@ -112,6 +112,8 @@ class SetEncoder(nn.Module):
 
     def forward(self, vectors: Tensor) -> Tensor:
         """Features of sets of vectors (B, K, inputs)."""
+        if vectors.shape[-2] == 0:  # an empty set is one of missing vectors
+            vectors = vectors.new_full((*vectors.shape[:-2], 1, self.inputs), torch.nan)
         there = ~torch.isnan(vectors).any(dim=-1, keepdim=True)
         scaled = (vectors - self.center) / self.spread
         read = self.each(torch.where(there, scaled, 0.0).to(_type_of(self.each)))

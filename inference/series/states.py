@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import numbers
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from bcppl.errors import InputError
 from bcppl.traces.carried import Entry
 from bcppl.traces.indexing import broadcast
 
@@ -15,9 +18,14 @@ from bcppl.traces.indexing import broadcast
 def merged(mask: Tensor, first: Any, second: Any) -> Any:
     """The states (N, ...) of the first where `mask` (N,) is true, of the second elsewhere.
 
-    Numbers, tensors without axes and None are the first's, for they are the same for all particles; anything
-    else than tensors and their containers is merged by its own `where(mask, other)`.
+    Numbers, text, tensors without axes and None are the first's, for they are the same for all particles;
+    anything else than tensors, arrays and their containers is merged by its own `where(mask, other)`.
+
+    Raises:
+        InputError: something else differs.
     """
+    if isinstance(first, np.ndarray):
+        return merged(mask, torch.from_numpy(first), torch.from_numpy(second)).numpy()
     if isinstance(first, Tensor):
         return first if first.ndim == 0 else torch.where(broadcast(mask, first), first, second)
     if isinstance(first, Mapping):
@@ -25,7 +33,14 @@ def merged(mask: Tensor, first: Any, second: Any) -> Any:
     if isinstance(first, list | tuple):
         parts = [merged(mask, a, b) for a, b in zip(first, second, strict=True)]
         return type(first)(*parts) if hasattr(first, "_fields") else type(first)(parts)
-    return first.where(mask, second) if hasattr(first, "where") else first
+    if first is second or first is None or isinstance(first, numbers.Number | str | np.generic):
+        return first
+    if not hasattr(first, "where"):
+        raise InputError(
+            f"a series' state holds a {type(first).__name__}, whose particles cannot be put together with "
+            "those of another; give it `where(mask, other)`, or hold tensors."
+        )
+    return first.where(mask, second)
 
 
 def merged_entries(mask: Tensor, first: Mapping[str, Entry], second: Mapping[str, Entry]) -> dict[str, Entry]:
@@ -37,15 +52,18 @@ def merged_entries(mask: Tensor, first: Mapping[str, Entry], second: Mapping[str
 def same(first: Any, second: Any, particles: int) -> Tensor:
     """Where the states of two batches of particles are equal but for rounding, (N,).
 
-    Only tensors are compared: a state that holds anything else counts as equal in that part.
+    Only tensors and arrays are compared: what else a state holds counts as equal.
     """
+    if isinstance(first, np.ndarray):
+        return same(torch.from_numpy(first), torch.from_numpy(second), particles)
     equal = torch.ones(particles, dtype=torch.bool)
     if isinstance(first, Tensor):
         if first.ndim == 0 or first is second:
             return equal
         if first.is_floating_point():
-            # A batch of another size may round the last digits in another way.
-            tolerance = torch.finfo(first.dtype).eps ** 0.6
+            # A batch of another size may round the last digits in another way. In single precision a few
+            # more would be as much as noise.
+            tolerance = max(16.0 * torch.finfo(first.dtype).eps, 4e-10)
             close = torch.isclose(first, second, rtol=tolerance, atol=tolerance**2, equal_nan=True)
         else:
             close = first == second

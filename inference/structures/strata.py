@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from bcppl.beliefs import Belief, effective_sample_size, normalised
-from bcppl.distributions.support import freedom_of
+from bcppl.distributions.support import freedom_of, is_of_angles
 from bcppl.errors import InputError, OtherKindError
 from bcppl.inference.population import FIELDS, Population
 from bcppl.inference.summaries import Probabilities
@@ -209,13 +209,19 @@ def probabilities(strata: Strata, address: str) -> Probabilities:
 def mean(strata: Strata, address: str) -> Tensor:
     """The weighted mean (*event) over the particles of all structures, of poses the mean pose (7,).
 
+    Of angles it is the direction of the mean vector.
+
     Raises:
         InputError: a structure does not visit the address, or the values' shapes differ.
     """
-    if freedom_of(next(iter(strata.populations.values())).trace.distributions[address]) is not None:
+    distribution = next(iter(strata.populations.values())).trace.distributions[address]
+    if freedom_of(distribution) is not None:
         return strata.belief(address).mean
-    weights = normalised(strata.log_weights)
-    return torch.einsum("n,n...->...", weights, strata[address].to(torch.float64))
+    weights, values = normalised(strata.log_weights), strata[address].to(torch.float64)
+    if not is_of_angles(distribution):
+        return torch.einsum("n,n...->...", weights, values)
+    sine, cosine = (torch.einsum("n,n...->...", weights, each) for each in (values.sin(), values.cos()))
+    return torch.atan2(sine, cosine)
 
 
 def concatenated_population(populations: Iterable[Population]) -> Population:

@@ -141,6 +141,15 @@ def offset(data: Data) -> Population:
     return population.with_trace(population.trace.at({"pose": turned}))
 
 
+@pytest.mark.parametrize("draws", [9, 10, 49, 50])
+@pytest.mark.parametrize("name", ["x", "distance", "log density"])
+def test_uniform_ranks_cover_what_they_should(name: str, draws: int) -> None:
+    ranks, none = np.arange(draws + 1)[:, None], np.zeros((draws + 1, 1))
+    exact = Calibration((name,), ranks, draws, none, np.zeros((draws + 1, draws, 1)), np.ones(draws + 1))
+    masses = (0.2, 0.5, 0.77, 0.8, 0.9, 1.0)
+    np.testing.assert_allclose(exact.coverage(name, masses), masses, atol=1e-12)
+
+
 def test_poses_and_choices_are_ranked() -> None:
     joint = Joint(posed, (), ("seen",))
     calibration = calibrate(joint, weighted, 20, posterior_draws=19)

@@ -58,6 +58,9 @@ def test_a_set_has_no_order_and_may_miss_some() -> None:
     loss = read(partly).sum()
     loss.backward()
     assert all(bool(torch.isfinite(p.grad).all()) for p in read.parameters() if p.grad is not None)
+    empty, missing = torch.zeros(2, 0, 3), torch.full((2, 1, 3), math.nan)
+    alone = SetEncoder(3)
+    assert torch.equal(alone(empty), alone(missing))
 
 
 @pytest.mark.parametrize("freedom", [Freedom(), PLANAR])

@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pyro
 import pyro.distributions as dist
+import pytest
 import torch
 from torch import Tensor
 
+from bcppl.errors import InputError
+from bcppl.inference import markov_chains
+from bcppl.inference.kernels import metropolis_hastings
+from bcppl.inference.proposals import drift
 from bcppl.inference.series import marginal
+from bcppl.inference.series.states import merged
 from bcppl.traces import Series, extend, generate, update
 from tests.inference.series.linear_series import AUTOREGRESSION, observed
 from tests.invariance import number
@@ -79,3 +86,41 @@ def test_steps_may_observe_other_numbers_of_readings() -> None:
     trace, _ = generate(program, ([(2,), (3,)],), seen, 6)
     exact = sum(dist.Normal(trace["rho"][:, None], 1.0).log_prob(y).sum(1) for y in seen.values())
     torch.testing.assert_close(trace.log_prob(*seen), exact)
+
+
+@pytest.mark.parametrize("kept", [lambda x: x, lambda x: x.numpy()])
+def test_states_may_hold_arrays(kept: Any) -> None:
+    """As by tensors: those of refused chains stay, so that what a step adds is Kalman's."""
+    torch.manual_seed(0)
+    one = torch.tensor(1.0, dtype=torch.float64)
+
+    def init() -> dict[str, Any]:
+        rho = pyro.sample("rho", dist.Uniform(0.2 * one, 0.95))
+        return {"rho": rho, "x": kept(pyro.sample("x", dist.Normal(0.0 * one, 1.0)))}
+
+    def step(state: dict[str, Any]) -> dict[str, Any]:
+        x = pyro.sample("x", dist.Normal(state["rho"] * torch.as_tensor(state["x"]), 0.5))
+        pyro.sample("y", dist.Normal(x, 0.5))
+        return {"rho": state["rho"], "x": kept(x)}
+
+    seen = [1.0, -0.5, 1.5]
+    program = marginal(Series(init, step), "rho", observed="y", particles=400)
+    observations = {f"y/{t}": torch.tensor(y) for t, y in enumerate(seen[:2], 1)}
+    trace, _ = generate(program, ([()] * 2,), observations, 100)
+    chains = markov_chains(metropolis_hastings(drift("rho")), trace, 2, progress=False)
+    longer, added = extend(chains.trace, ([()] * 3,), {"y/3": torch.tensor(seen[2])})
+    rho = longer["rho"]
+    mean, variance = torch.zeros(100).double(), torch.ones(100).double()
+    for y in seen:
+        mean, variance = rho * mean, rho**2 * variance + 0.25
+        exact = dist.Normal(mean, (variance + 0.25).sqrt()).log_prob(torch.tensor(y))
+        gain = variance / (variance + 0.25)
+        mean, variance = mean + gain * (y - mean), variance * (1.0 - gain)
+    assert float((added - exact).square().mean().sqrt()) < 0.25
+
+
+def test_a_state_that_cannot_be_merged_is_refused() -> None:
+    mask = torch.tensor([True, False])
+    assert merged(mask, ("text", 2, None), ("text", 2, None)) == ("text", 2, None)
+    with pytest.raises(InputError, match=r"state holds a set, whose particles .* give it `where"):
+        merged(mask, {1}, {2})

@@ -98,3 +98,33 @@ def test_a_check_of_a_pair_sees_a_value_that_is_detached_in_part() -> None:
     torch.testing.assert_close(whole.trace.log_prob(), population.trace.log_prob())
     with pytest.raises(InputError, match=r"Jacobian of a pair .* have to cancel"):
         move_and_weight(population, Pair(partial(turned, sign=1.0, cut=True), back, check=True))
+
+
+@pytest.mark.parametrize("centre", [1.0, 20.0, 300.0])
+def test_a_jump_in_single_precision_undoes_itself_to_rounding(centre: float) -> None:
+    one = torch.tensor(1.0)
+
+    def program() -> None:
+        count = structural("count", dist.Categorical(torch.ones(2))) + 1
+        means = [pyro.sample(f"mean_{j}", dist.Normal(centre * one, 10.0 * one)) for j in range(count)]
+        pyro.sample("y", dist.Normal(torch.stack(means).mean(0), one))
+
+    def split(trace: Trace) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        gap = pyro.sample("gap", dist.HalfNormal(one))
+        return {"mean_0": trace["mean_0"] - gap, "mean_1": trace["mean_0"] + gap}, {}
+
+    def merge(trace: Trace) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        first, second = trace["mean_0"], trace["mean_1"]
+        return {"mean_0": (first + second) / 2}, {"gap": (second - first) / 2}
+
+    torch.manual_seed(0)
+    strata = generate_strata(program, (), {"y": torch.tensor(centre)}, 400)
+    move = jump(
+        Jump(
+            to=lambda structure: {"count": 1} if structure["count"] == 0 else None,
+            back=lambda structure: {"count": 0} if structure["count"] == 1 else None,
+            forward=split,
+            backward=merge,
+        )
+    )
+    assert min(move(strata, POSTERIOR).acceptance) > 0.05

@@ -363,6 +363,17 @@ def test_the_mean_of_a_pose_is_one_pose() -> None:
     assert float(found[3:].norm()) == pytest.approx(1.0)
 
 
+def test_the_mean_of_an_angle_is_a_direction() -> None:
+    def program() -> None:
+        k = structural("k", dist.Bernoulli(torch.tensor(0.5)))
+        pyro.sample("angle", dist.VonMises(torch.tensor(math.pi), 50.0 + 0.0 * k))
+
+    torch.manual_seed(0)
+    assert abs(float(mean(generate_strata(program, (), {}, 2000), "angle"))) == pytest.approx(
+        math.pi, abs=0.02
+    )
+
+
 def test_a_structural_value_that_is_observed_names_its_stratum() -> None:
     def program(steps: int) -> None:
         structural("a", dist.Bernoulli(number(0.3)))
