@@ -33,8 +33,13 @@ HOMES: dict[str, tuple[ModuleType, str, str]] = {
 }
 
 
-def recording(name: str) -> Recording:
-    """The recording in a file, or a shipped one by name, checked, every measurement once."""
+def recording(name: str, model_given: str | None = None) -> Recording:
+    """The recording in a file, or a shipped one by name, checked, every measurement once.
+
+    Its sensors may be those that a model's file, which the command line gives, imports.
+    """
+    if model_given is not None and _is_file(model_given):
+        model(model_given)
     loaded = load_recording(name)
     validate(loaded)
     return once_each(loaded)
@@ -160,6 +165,9 @@ def _from_file(path: Path, package: ModuleType, word: str) -> ModuleType:
         if path.resolve().parent == Path(home).resolve():
             return import_module(f"{package.__name__}.{path.stem}")
     name = f"bcppl_user_{path.stem}"
+    state = (path.resolve(), path.stat().st_mtime_ns, path.stat().st_size)
+    if name in sys.modules and getattr(sys.modules[name], "__bcppl_read__", None) == state:
+        return sys.modules[name]  # once: a second pass would register its sensors again
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
         raise InputError(f"{path} is no Python file; give one ending in .py.")
@@ -178,4 +186,5 @@ def _from_file(path: Path, package: ModuleType, word: str) -> ModuleType:
     except (Exception, SystemExit) as error:
         what = f"the {word} file {path} stopped with {type(error).__name__}: {error}"
         raise InputError(f"{what}; run `python {path}` to see where.") from error
+    vars(module)["__bcppl_read__"] = state
     return module

@@ -49,7 +49,7 @@ def posterior(
         return _read(Path(name), of, model, settings, check)
     if of is not None:
         raise InputError(f"--of names a belief's recording, but {name} is a recording; leave it out.")
-    recording = loading.recording(name)
+    recording = loading.recording(name, model)
     check(recording)
     named = model or recording.model
     chosen = _static(loading.with_settings(loading.model(model, recording.model), settings, named), named)
@@ -88,7 +88,7 @@ def _read(
     of = of or record.get("recording")
     if of is None:
         raise InputError(f"{path} names no recording, nor does a run.json beside it; give --of RECORDING.")
-    whole = loading.recording(of)
+    whole = loading.recording(of, model)
     by = "the recording" if record.get("model") is None else str(path.parent / "run.json")
     named = record.get("model") or whole.model
     settings = {**record.get("settings", {}), **settings}

@@ -16,8 +16,8 @@ from bcppl.beliefs.regions import rotation_angle, translation_distance
 from bcppl.cli import latent_sites
 from bcppl.cli.predictive_checks import PredictiveChecks, piece_errors
 from bcppl.errors import InputError
-from bcppl.geometry.holes import hole_of
-from bcppl.geometry.parts import with_tip_at
+from bcppl.geometry.holes import fit_in, hole_of
+from bcppl.geometry.parts import Part, with_tip_at
 from bcppl.inference.criticism import Explanation, explanations
 from bcppl.inference.planning.insertion import InsertionParameters
 from bcppl.recordings import Recording
@@ -227,9 +227,22 @@ def conclusion(belief: Belief, recording: Recording, doubtful: bool) -> str:
     if doubtful:
         return f"{where}, {sure}; see to the warnings before you trust it."
     # As wide as a search may be (`InsertionParameters.maximum_radius`).
-    ready = what == "hole" and radii[0] < InsertionParameters().maximum_radius
+    ready = (
+        what == "hole"
+        and _fits(recording.part, recording.peg)
+        and radii[0] < InsertionParameters().maximum_radius
+    )
     advice = "try the insertion (bcppl insert)" if ready else "touch or look once more (bcppl probe)"
     return f"{where}, {sure}; {advice}."
+
+
+def _fits(part: Part, peg: Part) -> bool:
+    """Whether a peg goes into the part's hole."""
+    try:
+        fit_in(hole_of(part, peg=peg), peg)
+    except InputError:
+        return False
+    return True
 
 
 def _place(belief: Belief, recording: Recording) -> tuple[str, torch.Tensor]:

@@ -162,7 +162,8 @@ def _read_elsewhere(path: Path, within: Sequence[str]) -> None:
     """Read a file in a process of its own.
 
     Raises:
-        OSError: that was refused, took too much memory or time, or the process crashed.
+        OSError: that was refused, took too much memory, or the process crashed.
+        InputError: it took too long.
     """
     command = [sys.executable, "-P", structure.__file__, os.fspath(path.absolute()), *within]
     known = os.pathsep.join(each for each in sys.path if each)
@@ -173,7 +174,9 @@ def _read_elsewhere(path: Path, within: Sequence[str]) -> None:
             command, env=environment, stdin=subprocess.DEVNULL, capture_output=True, timeout=patience
         )
     except subprocess.TimeoutExpired:
-        raise OSError(f"HDF5 was not done with it in {patience:.0f} s") from None
+        raise InputError(
+            f"{path} was not read in {patience:.0f} s: the machine is busy or the file is damaged; try again."
+        ) from None
     if done.returncode == structure.REFUSED:
         raise OSError(done.stdout.decode(errors="replace").strip())
     if done.returncode != 0:

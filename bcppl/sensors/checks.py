@@ -38,6 +38,11 @@ def pose(what: str, values: object) -> Iterator[str]:
         yield f"{what} has shape {numbers.shape}; a pose is seven numbers {POSE_NUMBERS}."
     elif problem := pose_problem(what, numbers):
         yield problem
+    elif (away := float(np.abs(numbers[:3]).max())) > FARTHEST:
+        yield (
+            f"{what} is {away:.4g} m from its frame's origin, probably millimetres; scale x, y and z by "
+            "0.001 to metres."
+        )
 
 
 def times(what: str, values: Array, remedy: str = LEAVE_OUT) -> Iterator[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +15,7 @@ import pytest
 from bcppl.inference import tempered_smc
 from bcppl.models.look_and_touch import model
 from bcppl.recordings import load, problems, save
-from bcppl.sensors import Measurement, sensor_named
+from bcppl.sensors import Measurement, protocol, sensor_named
 from tests.command_line import FEW_MOVES, Ran, short
 
 
@@ -58,6 +59,18 @@ def test_a_new_sensor_is_saved_checked_and_explained(
     scene = model.prepare(load(tmp_path / "own.h5"))
     *_, last = tempered_smc.infer(model, recording, particles=40, scene=scene, sweeps=2)
     assert last.taken == 2 and np.isfinite(last.info.log_evidence)
+
+    # Of another process, in which the model's file imports the sensor's.
+    assert bcppl("new", "model", "gauged").code == 0
+    file = tmp_path / "gauged.py"
+    file.write_text(file.read_text().replace("\nimport ", "\nimport gauge\nimport ", 1))
+    monkeypatch.delitem(sys.modules, "gauge")
+    for registered in (protocol._registered, protocol._by_type):
+        for key in [k for k, v in registered.items() if "gauge" in (k, getattr(v, "kind", ""))]:
+            del registered[key]
+    assert "unknown kind 'gauge'" in bcppl("run", "own.h5", "--particles", 8).err
+    ran = bcppl("run", "own.h5", "--particles", 8, "--inference", FEW_MOVES, "--model", "gauged.py")
+    assert ran.code == 0, ran.err
 
 
 def test_what_is_there_is_not_written_over_and_names_are_names(bcppl: Callable[..., Ran]) -> None:

@@ -11,6 +11,7 @@ import torch
 from bcppl import poses
 from bcppl.beliefs import Belief
 from bcppl.cli.report import WIDTHS, conclusion, relative_to_peg, result
+from bcppl.geometry.extrusion import round_peg
 from bcppl.geometry.holes import hole_of
 from bcppl.models import load_recording
 from tests.command_line import short
@@ -85,6 +86,8 @@ def test_the_last_line_says_in_words_where_and_how_sure_and_what_to_do() -> None
     assert float(re.findall(r"sure to ([\d.]+) mm", line)[0]) == pytest.approx(0.25, abs=0.025)
     assert conclusion(unsure, recording, False).endswith("touch or look once more (bcppl probe).")
     assert "see to the warnings" in conclusion(sure, recording, True)
+    thick = replace(recording, peg=round_peg(0.06, 0.1))
+    assert conclusion(sure, thick, False).endswith("touch or look once more (bcppl probe).")
     pushes = replace(short(1), truth=None)
     assert conclusion(around(TRUTH, 0.001), pushes, False).startswith("the part is at")
     assert "too few to say how sure" in conclusion(around(TRUTH, 0.001, 4), pushes, False)

@@ -155,5 +155,6 @@ def test_an_inference_program_without_start_is_named(bcppl: Callable[..., Ran], 
     save(short(1), tmp_path / "short.h5")
     words = ("--particles", 4, "--inference", "plain.py")
     assert bcppl("run", "short.h5", *words, "--out", "out").code == 0
-    ran = bcppl("run", "--resume", "out", "--inference", "plain.py")
-    assert ran.code == 2 and "its `infer` takes no `start`" in ran.err
+    for command in (("run", "--resume", "out"), ("live", "short.h5")):
+        ran = bcppl(*command, "--inference", "plain.py")
+        assert ran.code == 2 and "its `infer` takes no `start`" in ran.err

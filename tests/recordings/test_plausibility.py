@@ -27,7 +27,7 @@ from bcppl.models.worlds.bench.parameters import BenchParameters
 from bcppl.models.worlds.bench.scene import bench_scene
 from bcppl.models.worlds.simulated_sensors import windows
 from bcppl.recordings import Recording, problems, save
-from bcppl.robot.motion import Probe
+from bcppl.robot.motion import Probe, ProbeWindow
 from bcppl.sensors.plausibility import doubts
 from bcppl.sensors.plausibility.torques import torque_doubt
 from tests.made_recordings import assert_one_sentence, full
@@ -115,6 +115,29 @@ def test_torques_are_compared_with_those_of_the_forces_at_the_contacts() -> None
     np.testing.assert_allclose([float(each) for each in found.groups()], [0.0, 0.0, 50.0], atol=3.0)
     # Forces through the peg's origin exert none.
     assert " ".join(torque_doubt(np.hstack([force, np.zeros((40, 3))]), 0.01 * force / 6.0)) == ""
+
+
+def test_a_probe_without_a_command_is_not_doubted_for_it() -> None:
+    recording = plausibility.command_still(load_recording("peg_probe"))
+    assert "a command that never changes" in " ".join(doubts(recording))
+    free = [
+        replace(m, action=replace(m.action, probe=replace(m.action.probe, stiffness=np.zeros(6))))
+        if isinstance(m.action, ProbeWindow)
+        else m
+        for m in recording.measurements
+    ]
+    assert doubts(replace(recording, measurements=free)) == []
+
+
+def test_a_guess_in_millimetres_is_named_with_views_and_without() -> None:
+    recording = load_recording("peg_probe")
+    pose = np.array(recording.guess.world_from_part)
+    pose[:3] *= 1e3
+    wrong = replace(recording, guess=replace(recording.guess, world_from_part=pose))
+    for each in (wrong, replace(wrong, measurements=[])):
+        assert (
+            "the guess (world_from_part)" in problems(each)[0] and "probably millimetres" in problems(each)[0]
+        )
 
 
 def test_a_recording_of_a_few_pixels_is_not_judged() -> None:

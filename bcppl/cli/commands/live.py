@@ -235,7 +235,10 @@ def _chosen(
     """The recording, the model with its settings, and the inference program."""
     from bcppl.cli import loading
 
-    measured = loading.recording(name)
+    measured = loading.recording(name, model)
     named = model or measured.model
     chosen = loading.with_settings(loading.model(model, measured.model), loading.settings(set_ or []), named)
-    return measured, chosen, loading.inference(inference, chosen)[1]
+    given, infer = loading.inference(inference, chosen)
+    cure = "let it take start=None, and give it to `smc`"
+    loading.check_takes(infer, "start", f"{given} cannot go on from one measurement to the next", cure)
+    return measured, chosen, infer

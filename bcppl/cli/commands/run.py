@@ -93,7 +93,7 @@ def run(
         raise InputError("there is nothing to run; give a recording, or the folder of a run by --resume.")
     with catch_warnings(record=True) as warned:
         simplefilter("always")
-        measured = loading.recording(recording)
+        measured = loading.recording(recording, model)
     settings = record.get("settings") or loading.settings(set_ or [])
     named, by = record.get("model", measured.model), f"the run in {resume}" if record else "the recording"
     chosen = loading.with_settings(loading.model(model, named, by), settings, model or named)

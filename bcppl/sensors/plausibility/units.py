@@ -86,7 +86,12 @@ def zero_doubt(felt: Felt) -> Iterator[str]:
 
 
 def command_doubt(felt: Felt) -> Iterator[str]:
-    """The mistake in words where a command stands still while the peg moves."""
+    """The mistake in words where a command stands still while the peg moves.
+
+    Where nothing pulls the peg towards it, no command is known.
+    """
+    if not np.any(felt.probe.stiffness):
+        return
     command = np.asarray(felt.probe.command, dtype=float)
     if command.ndim != 2 or command.shape[1:] != (7,):
         return

@@ -87,10 +87,12 @@ def on_one_clock(
     within = _WITHIN if fields.within is None else unit * fields.within
     found = None if force is None else lateness(force, position, within, fields.estimate != "offset")
     if found is None:
+        cure = "straight guarded touches at 20 mm/s and more"
+        if _blind(position) > _KNOWN:
+            cure = f"poses at 200 Hz and more, for those at {1.0 / position.step:.0f} Hz are too far apart"
         report.append(
             f"clocks: the motion does not show how late the wrench is (from {-1000.0 * within:.0f} to "
-            f"{1000.0 * within:.0f} ms), and nothing is taken off; state clock.wrench_late, or log straight "
-            "guarded touches at 20 mm/s and more"
+            f"{1000.0 * within:.0f} ms), and nothing is taken off; state clock.wrench_late, or log {cure}"
         )
         return wrench
     if found.contradicting:
@@ -150,8 +152,7 @@ def lateness(force: Stream, position: Stream, within: float, drifts: bool = Fals
     share /= share.sum()
     late, drift = share.sum(axis=0) @ lates, share.sum(axis=1) @ rates
     variance = share.sum(axis=0) @ np.square(lates - late)
-    blind = _BLIND * position.step * max(1.0, position.step / _SLOW)
-    spread = float(np.sqrt(variance + _LEAST**2 + np.square(blind)))
+    spread = float(np.sqrt(variance + _LEAST**2 + np.square(_blind(position))))
     # Along the drift: at the ends of a long log clocks are farther apart than an estimate may be off.
     behind = drift * (times - middle) / _COARSE
     if margin := int(np.ceil(np.abs(behind).max())):
@@ -174,6 +175,11 @@ def lateness(force: Stream, position: Stream, within: float, drifts: bool = Fals
         contacts=len(felt),
         contradicting=tuple(times[contradicts].tolist()),
     )
+
+
+def _blind(position: Stream) -> float:
+    """How late a wrench may be, s, without that poses so far apart in time show it."""
+    return float(_BLIND * position.step * max(1.0, position.step / _SLOW))
 
 
 def _thinned(stream: Stream, step: float) -> Stream:
