@@ -72,7 +72,7 @@ BAD: dict[str, tuple[Callable[[], Recording], str]] = {
     "open mesh": (lambda: part(faces=short().part.faces[1:]), "open mesh"),
     "empty mesh": (lambda: part(faces=np.zeros((0, 3), dtype=np.int64)), "empty mesh"),
     "camera inside the part": (lambda: viewed(height=0.01), "inside it"),
-    "camera in millimetres": (lambda: viewed(height=500.0), "wrong units"),
+    "camera in millimetres": (lambda: viewed(height=500.0), "probably millimetres"),
     "depth image of another size": (lambda: viewed(rows=5), "8×5"),
     "times that run backwards": (
         lambda: first_push(times=changed(touch_of(short()).times, 7, 0.0)),

@@ -103,7 +103,7 @@ WRONG: dict[str, tuple[Recording, str]] = {
     ),
     "camera in millimetres": (
         with_measurement(2, world_from_camera=np.array([0.0, 0, 600, 0, 1, 0, 0])),
-        "measurement 2: camera .* wrong units",
+        "measurement 2: camera .* probably millimetres",
     ),
     "focal length in millimetres": (
         with_measurement(2, fx=0.0193, fy=0.0193),
