@@ -8,7 +8,7 @@ import numpy as np
 
 from bcppl.arrays import Array
 
-# Of 32 right scenes of the bench the correlation is 0.98 to 1, and the point is within 12 mm of the origin.
+# In right scenes of the bench the correlation is nearly 1, and the point within 15 mm of the peg's origin.
 OPPOSED = 0.5  # correlation of torques with those of the forces, reversed
 MOVED = 0.03  # m: another point of the torques; a side that touches is as near anywhere along it
 EXPLAINED = 0.1  # of the square of what differs: at most so much is left about that point
