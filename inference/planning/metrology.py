@@ -118,7 +118,7 @@ def three_two_one(
     top = top_of(part)
     height = top - min(chosen.side_depth, 0.5 * float(part.extent[2]))
     radius = float(np.linalg.norm(peg.vertices[:, :2], axis=1).max())
-    lateral = half_stroke(belief, np.array([0.0, 0.0, top]), np.array([1.0, 0.0, 0.0]), chosen)
+    lateral = max(half_stroke(belief, np.array([0.0, 0.0, top]), axis, chosen) for axis in np.eye(3)[:2])
     points = points_on_top(part, peg, lateral)
     last = points.positions[2]
     first, second = _two_sides(sides(part, height), last, radius)
@@ -164,10 +164,12 @@ class _SideTouch(NamedTuple):
     ) -> _SideTouch:
         normal = np.array([*face.normal, 0.0])
         reach = float((peg.vertices[:, :2] @ -face.normal).max())  # of the peg towards the face
-        middle = np.array([*0.5 * (face.start + face.stop), height])
-        stroke = half_stroke(belief, middle, normal, parameters)
+        ends = np.array([[*face.start, height], [*face.stop, height]])
         tangent = np.array([-normal[1], normal[0], 0.0])
-        inset = min(face.length / 3.0, half_stroke(belief, middle, tangent, parameters))
+        inset = min(face.length / 3.0, half_stroke(belief, ends, tangent, parameters))
+        inwards = inset * (ends[1] - ends[0]) / max(face.length, 1e-9)
+        # The stroke may be at either end, where yaw moves the face further than in its middle.
+        stroke = half_stroke(belief, ends + np.array([inwards, -inwards]), normal, parameters)
         return cls(
             face,
             height,
@@ -251,7 +253,7 @@ def _two_sides(faces: list[Side], near: Array, radius: float) -> tuple[Side, Sid
 
 def _on_top(belief: Belief, points: TopPoints, top: float, parameters: MetrologyParameters) -> list[Waypoint]:
     a, b, c = (np.array([*point, top]) for point in points.positions)
-    up = half_stroke(belief, a, UP, parameters) * UP
+    up = half_stroke(belief, np.stack([a, b, c]), UP, parameters) * UP
     on = -up - parameters.press_depth * UP
 
     def touch(point: Array) -> list[Waypoint]:

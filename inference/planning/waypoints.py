@@ -44,17 +44,18 @@ class Waypoint(NamedTuple):
 
 
 def half_stroke(
-    belief: Belief, position: Array, normal: Array, limits: TouchParameters | MetrologyParameters
+    belief: Belief, positions: Array, normal: Array, limits: TouchParameters | MetrologyParameters
 ) -> float:
     """Half the length (m) of a guarded stroke, in proportion to the uncertainty of the surface's position.
 
-    The position (3,) on the surface and its normal (3,) are in the part's frame.
+    The position (3,) on the surface, or several (K, 3), of which the most uncertain counts, and the normal
+    (3,) there are in the part's frame.
     """
-    positions = poses.transform(belief.world_from_part, torch.as_tensor(position)[None])[:, 0]
+    of_particles = poses.transform(belief.world_from_part, torch.as_tensor(np.atleast_2d(positions)))
     direction = poses.rotation_matrix(belief.mean) @ torch.as_tensor(normal)
-    along = positions @ direction
+    along = of_particles @ direction  # (N, K)
     mean = belief.weights @ along
-    deviation = float(torch.sqrt(belief.weights @ (along - mean) ** 2))
+    deviation = float(torch.sqrt(belief.weights @ (along - mean) ** 2).max())
     shortest, longest = limits.shortest_half_stroke, limits.longest_half_stroke
     return float(np.clip(limits.standard_deviations * deviation, shortest, longest))
 

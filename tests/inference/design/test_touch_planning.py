@@ -271,6 +271,20 @@ def test_strokes_are_as_long_as_the_belief_is_unsure() -> None:
     assert shortest < lengths[1][1] < longest
 
 
+@pytest.mark.parametrize("axis", range(6))
+def test_a_stroke_begins_beside_the_part_and_ends_in_it_wherever_it_may_be(axis: int) -> None:
+    part, peg = block_with_square_hole((0.12, 0.08, 0.025)), round_peg(0.004, 0.08)
+    normal = torch.linspace(-2.8, 2.8, 401, dtype=torch.float64)  # within three standard deviations
+    away = torch.zeros(401, 6, dtype=torch.float64)
+    away[:, axis] = (0.0025 if axis < 3 else 0.03) * normal
+    world_from_part = poses.retract(poses.identity(), away)
+    plan = three_two_one(Belief(world_from_part, -0.5 * normal**2), part, peg)
+    strokes = [k for k, manner in enumerate(plan.manners) if manner == "guarded"]
+    ends = torch.from_numpy(plan.world_from_peg[[*strokes, *(k + 1 for k in strokes)]])
+    begun, ended = PegGap(part, peg)(world_from_part, ends).distance.split(len(strokes), dim=1)
+    assert begun.min() > -2e-4 and ended.max() < 2e-4  # the edge of a turned peg is ahead of its tip
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_rocked_peg_leans_and_turns_both_ways_about_its_tip_and_stays_in_contact(seed: int) -> None:
