@@ -6,11 +6,15 @@ import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
+
 from bcppl.arguments import number_within
+from bcppl.arrays import Array
 from bcppl.beliefs import Belief
 from bcppl.cli.arm import arm_with_peg
 from bcppl.errors import InputError
 from bcppl.geometry.gap import PegGap
+from bcppl.geometry.holes import hole_of
 from bcppl.inference.planning.candidate_layout import MIXED, plan_candidates
 from bcppl.inference.planning.constraints import Candidates, Constraint, feasible, require_candidates
 from bcppl.inference.planning.generators import MOTIONS, candidate_kinds
@@ -93,23 +97,48 @@ def reach(
     return [] if arm is None else [within_reach(arm, seed=seed)]
 
 
+def point_inside(words: str | None) -> tuple[float, float] | None:
+    """The point of --inside, m in the part's frame, where it is given."""
+    if words is None:
+        return None
+    x, y = numbers("--inside", words, "two", "x y")
+    return float(x), float(y)
+
+
+def numbers(option: str, words: str, count: str, names: str) -> Array:
+    """The numbers of an option, as many as it has names."""
+    try:
+        given = np.array([float(word) for word in words.replace(",", " ").split()])
+    except ValueError:
+        given = np.empty(0)
+    if len(given) != len(names.split()) or not np.isfinite(given).all():
+        raise InputError(f"{option} is {words[:60]!r}; give {count} numbers in metres: {names}.")
+    return given
+
+
 def planned(
     asked: Asked,
     belief: Belief,
     recording: Recording,
     constraints: Sequence[Constraint],
     table: float | None,
+    inside: tuple[float, float] | None,
     seed: int,
 ) -> Candidates:
-    """The candidates that satisfy the constraints, a table's height (m) among them."""
+    """The candidates that satisfy the constraints, a table's height (m) among them.
+
+    Searches and attempts are for the hole around a point, m in the part's frame, where one is given.
+    """
     if table is not None:
         number_within("--table is {}", table)
         constraints = [above_table(recording.peg, table), *constraints]
+    part, peg = recording.part, recording.peg
+    hole = None if inside is None or peg is None else hole_of(part, inside, peg)
     if isinstance(asked, Mapping):
         like = [m.action for m in recording.measurements]
         return plan_candidates(
-            belief, recording.part, recording.peg, asked, constraints=constraints, like=like, seed=seed
+            belief, part, peg, asked, constraints=constraints, hole=hole, like=like, seed=seed
         )
-    if recording.peg is not None and any(planner_of(each).needs_peg for each in asked):
-        constraints = [collision_free(PegGap(recording.part, recording.peg), belief.mean), *constraints]
+    if peg is not None and any(planner_of(each).needs_peg for each in asked):
+        constraints = [collision_free(PegGap(part, peg), belief.mean), *constraints]
     return require_candidates(feasible(asked, constraints))

@@ -36,6 +36,11 @@ InferenceName = Annotated[
 
 Particles = Annotated[int, typer.Option(min=2, help="How many particles; a belief has its own.")]
 
+Inside = Annotated[
+    str | None,
+    typer.Option(help="A point (m) in the hole, in the part's frame; needed where there are several: x y."),
+]
+
 AsJson = Annotated[
     bool, typer.Option("--json", help="Print the result as JSON; all else goes to standard error.")
 ]

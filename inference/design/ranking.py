@@ -230,6 +230,8 @@ def costs_in_nats(candidates: Sequence[Any], cost: Costs | None, rate: Cost) -> 
 
 
 def _cost(number: int, candidate: Any, cost: Any, rate: Cost) -> float:
+    if isinstance(cost, Mapping) and candidate not in cost:
+        raise InputError(f"candidate {number} is missing in the mapping of costs; give the cost of each.")
     price = cost[candidate] if isinstance(cost, Mapping) else cost(candidate)
     if not isinstance(price, Mapping):
         if isinstance(rate, Mapping):

@@ -20,6 +20,7 @@ from typing import Any, Literal, TypeVar
 from bcppl.arguments import number_within, whole_number
 from bcppl.beliefs import Belief
 from bcppl.errors import InferenceError, InputError
+from bcppl.geometry.holes import Hole
 from bcppl.inference.design.ranking import Ranking
 from bcppl.inference.design.rules import AcquisitionRule, by_linearised_gain
 from bcppl.inference.filters.default import default_inference
@@ -221,18 +222,24 @@ class Filter:
         return named_apart(candidate, self._recording, [*arrived, *others])
 
     def insertion(
-        self, parameters: InsertionParameters | None = None, timeout: float | None = None
+        self,
+        parameters: InsertionParameters | None = None,
+        hole: Hole | None = None,
+        timeout: float | None = None,
     ) -> InsertionPlan:
         """A compliant insertion at the newest belief (`bcppl.inference.planning.insertion`).
 
+        Of a part with several holes, `hole` is one of them (`bcppl.geometry.holes.hole_of`).
+
         Raises:
-            InputError: there is no peg, the part has no hole or several, or the peg does not fit.
+            InputError: there is no peg, the part has no hole, or several and none is given, or the peg does
+                not fit.
             InferenceError: a measurement has ended the filter.
         """
         peg = self._recording.peg
         if peg is None:
             raise InputError("there is no peg to insert; add it to the recording.")
-        plan = lambda: insertion_plan(self.belief, self._recording.part, peg, parameters=parameters)  # noqa: E731
+        plan = lambda: insertion_plan(self.belief, self._recording.part, peg, hole, parameters)  # noqa: E731
         return self._run(plan, timeout)
 
     def view(self, title: str = "", arm: ArmWithPeg | None = None) -> LivePage:

@@ -7,7 +7,8 @@
     {"ask": "view", "camera": {...}, "depth": (H, W)}       a depth image, m
     {"ask": "belief"}                  {"mean": (7,), "covariance": (6, 6), "effective", "behind", ...}
     {"ask": "next_probe"}              {"plan": {...}, "gain": nats}
-    {"ask": "insertion"}               {"search": {...}, "push": {...}}
+    {"ask": "insertion"}               {"search": {...}, "push": {...}}; of several holes the one around
+                                       a point "inside" (x, y), m in the part's frame
 
 An answer has "error", one sentence, where something is wrong; of samples, all rows that are right are kept,
 and what is complete with them is assimilated. An error of the program itself is logged with its traceback.
@@ -26,6 +27,7 @@ from bcppl import poses
 from bcppl.arguments import number_within
 from bcppl.arrays import Array
 from bcppl.errors import InferenceError, InputError, reason_of
+from bcppl.geometry.holes import hole_of
 from bcppl.inference.live.filter import Filter
 from bcppl.inference.live.sampler import Sampler
 from bcppl.robot.motion import Probe
@@ -46,6 +48,7 @@ FIELDS = {
     "begin": {"plan", "name", "begin", "seconds", "rate"},
     "samples": {"wrench", "pose"},
     "view": {"camera", "depth"},
+    "insertion": {"inside"},
 }
 
 
@@ -161,8 +164,12 @@ class Session:
         plan = self.live.named_apart(best.candidate, self._names)
         return {"plan": planner_of(plan).candidate.tree(plan), "gain": best.information_gain}
 
-    def _insertion(self, _: Mapping[str, Any]) -> Answer:
-        plan = self.live.insertion(timeout=WAITS)
+    def _insertion(self, request: Mapping[str, Any]) -> Answer:
+        hole = None
+        if "inside" in request:
+            recording, inside = self.live.recording, _point(request["inside"])
+            hole = hole_of(recording.part, inside, recording.peg)
+        plan = self.live.insertion(hole=hole, timeout=WAITS)
         layout = _layout("window").candidate
         return {"search": layout.tree(plan.search), "push": layout.tree(plan.push)}
 
@@ -175,6 +182,14 @@ class Session:
         for each in windows:
             self.live.observe(each.action, each.observation)
         return len(windows)
+
+
+def _point(inside: Any) -> tuple[float, float]:
+    """The point of a request (x, y), m."""
+    numbers = isinstance(inside, (list, tuple, np.ndarray)) and len(inside) == 2
+    if not numbers or not all(isinstance(x, (int, float)) and abs(x) < np.inf for x in inside):
+        raise InputError(f"inside is {str(inside)[:40]}; give two numbers in metres, x and y.")
+    return float(inside[0]), float(inside[1])
 
 
 def _layout(kind: str) -> Plannable:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,8 +15,11 @@ import torch
 from shapely.affinity import translate
 
 from bcppl import Belief, Part, poses
+from bcppl.cli import candidates
+from bcppl.errors import InputError
 from bcppl.geometry.extrusion import block_with_hole, extruded, peg_for
 from bcppl.geometry.outlines import rectangular_outline, round_outline
+from bcppl.models import load_recording
 from bcppl.recordings.action_file import load_actions
 from bcppl.robot.plan import Plan
 from tests.command_line import Ran
@@ -86,6 +90,21 @@ def test_one_of_several_holes_is_chosen(planned: Callable) -> None:
     ):
         ran, _ = planned(plate, world_from_part, *words)
         assert ran.code == 2 and message in ran.err, ran.err
+
+
+def test_candidates_that_search_are_for_the_hole_that_is_chosen() -> None:
+    holes = [translate(OUTLINE, x).exterior for x in (-0.015, 0.015)]
+    plate = extruded("plate", shapely.Polygon(rectangular_outline(0.08, 0.04).exterior, holes), -0.02, 0.0)
+    world_from_part = about((0.5, 0.0, 0.15, 1.0, 0.0, 0.0, 0.0), (1e-4,) * 3 + (0.0,) * 3)
+    belief = Belief(world_from_part, torch.zeros(200, dtype=torch.float64))
+    recording = replace(load_recording("peg_probe"), part=plate, peg=PEG, measurements=[])
+    for x in (-0.015, 0.015):
+        searches = candidates.planned({"search": 2}, belief, recording, [], None, (x, 0.001), 0)
+        for each in searches:
+            middle = each.world_from_peg[each.manners.index("searching"), 0]
+            assert middle == pytest.approx(0.5 + x, abs=1e-3)
+    with pytest.raises(InputError, match="2 holes in its top"):
+        candidates.planned({"search": 2}, belief, recording, [], None, None, 0)
 
 
 @pytest.mark.long

@@ -286,6 +286,14 @@ def test_a_field_that_is_unknown_is_not_passed_over(
     assert sentence in session.answer(asked)["error"]
 
 
+def test_an_insertion_is_into_the_hole_that_is_asked_for(session: Session) -> None:
+    planned = session.answer({"ask": "insertion", "inside": [0.001, 0.0]})
+    same = session.answer({"ask": "insertion"})
+    np.testing.assert_array_equal(planned["push"]["world_from_peg"], same["push"]["world_from_peg"])
+    assert "no hole around" in session.answer({"ask": "insertion", "inside": [0.028, 0.0]})["error"]
+    assert "give two numbers in metres" in session.answer({"ask": "insertion", "inside": "middle"})["error"]
+
+
 def test_a_probe_of_too_many_stamps_is_refused_before_they_are_made(session: Session) -> None:
     tracemalloc.start()
     probe = {"ask": "begin", "name": "p", "begin": 0.0, "rate": 1e5, "seconds": 600.0}

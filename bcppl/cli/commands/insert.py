@@ -13,6 +13,7 @@ from bcppl.cli.options import (
     AsJson,
     Given,
     InferenceName,
+    Inside,
     Link,
     LinkFromPeg,
     ModelName,
@@ -50,12 +51,7 @@ def insert(
         str | None,
         typer.Option(help=f"Corners of the box (m, in the world) that the peg's tip may not leave: {SIX}."),
     ] = None,
-    inside: Annotated[
-        str | None,
-        typer.Option(
-            help="A point (m) in the hole, in the part's frame; needed where there are several: x y."
-        ),
-    ] = None,
+    inside: Inside = None,
     simulations: Annotated[
         int, typer.Option(min=0, help="How many particles the chance is simulated for; 0 for none.")
     ] = 24,
@@ -78,7 +74,7 @@ def insert(
     from rich.console import Console
 
     from bcppl.cli import loading
-    from bcppl.cli.candidates import reach
+    from bcppl.cli.candidates import point_inside, reach
     from bcppl.cli.posterior import posterior
     from bcppl.contact.physics import PegPhysics
     from bcppl.geometry.holes import fit_in, hole_of
@@ -90,7 +86,7 @@ def insert(
         raise InputError(f"--output is {output}; give a file that ends in {' or '.join(SUFFIXES)}.")
     refuse_overwriting("--output", output, recording, of, model, inference, *files_of_run(recording))
     box = None if workspace is None else _box(workspace)
-    point = None if inside is None else _numbers("--inside", inside, "two", "x y")
+    point = point_inside(inside)
     constraints = reach(robot, link, link_from_peg, world_from_base, seed)
     console = Console(highlight=False, stderr=as_json)
     found: dict[str, Any] = {"output": str(output)}
@@ -107,7 +103,7 @@ def insert(
         push_force=force,
         contact_force=min(usual.contact_force, force),
     )
-    hole = hole_of(part, None if point is None else (point[0], point[1]), peg)
+    hole = hole_of(part, point, peg)
     plan = insertion_plan(belief, part, peg, hole, careful)
     if box is not None:
         _refuse_outside(plan, peg, box)
@@ -154,23 +150,12 @@ def _refuse(recording: Recording) -> None:
 
 def _box(words: str) -> Array:
     """The lowest and the highest corner (2, 3) of a box, m."""
-    corners = _numbers("--workspace", words, "six", SIX).reshape(2, 3)
+    from bcppl.cli.candidates import numbers
+
+    corners = numbers("--workspace", words, "six", SIX).reshape(2, 3)
     if not (corners[0] < corners[1]).all():
         raise InputError(f"--workspace is {words[:60]!r}; give the lowest corner, then the highest: {SIX}.")
     return corners
-
-
-def _numbers(option: str, words: str, count: str, names: str) -> Array:
-    """The numbers of an option, as many as it has names."""
-    import numpy as np
-
-    try:
-        numbers = np.array([float(word) for word in words.replace(",", " ").split()])
-    except ValueError:
-        numbers = np.empty(0)
-    if len(numbers) != len(names.split()) or not np.isfinite(numbers).all():
-        raise InputError(f"{option} is {words[:60]!r}; give {count} numbers in metres: {names}.")
-    return numbers
 
 
 def _refuse_outside(plan: InsertionPlan, peg: Part, box: Array) -> None:

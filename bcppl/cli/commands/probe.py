@@ -15,6 +15,7 @@ from bcppl.cli.options import (
     AsJson,
     Given,
     InferenceName,
+    Inside,
     Link,
     LinkFromPeg,
     ModelName,
@@ -77,6 +78,7 @@ def probe(
     table: Annotated[
         float | None, typer.Option(help="Height (m) of a table that no plan may lead into.")
     ] = None,
+    inside: Inside = None,
     above: Annotated[
         float | None,
         typer.Option(
@@ -110,7 +112,7 @@ def probe(
 
     output = Path(f"{Path(recording).stem}_next.json") if output is None else output
     picture = _picture(output, [recording, *filter(None, (candidates, of, model, inference))])
-    asked = options.asked_for(candidates)
+    asked, point = options.asked_for(candidates), options.point_inside(inside)
     constraints = options.constraints(force, seconds, above)
     constraints += options.reach(robot, link, link_from_peg, world_from_base, seed)
     console = Console(highlight=False, stderr=as_json)
@@ -119,7 +121,7 @@ def probe(
     now = posterior(recording, of, model, given, inference, particles, seed, console, refuse)
     belief = now.population.belief(now.model.pose)
     require_uncertain(belief)
-    listed = options.planned(asked, belief, now.recording, constraints, table, seed)
+    listed = options.planned(asked, belief, now.recording, constraints, table, point, seed)
     console.print(escape(visible(str(listed))), soft_wrap=True)
     scene = now.model.prepare(with_candidates(now.recording, listed))
     linearised = can_be_linearised(scene, listed)

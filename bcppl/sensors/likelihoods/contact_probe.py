@@ -282,7 +282,7 @@ class ContactProbe:
     def _entry(self) -> HoleEntry | None:
         """How the peg goes into the part's hole; None without one, with several, or for another peg."""
         try:
-            return HoleEntry(self.gap, self.peg, hole_of(self.gap.part))
+            return HoleEntry(self.gap, self.peg, hole_of(self.gap.part, peg=self.peg))
         except InputError:
             return None
 

@@ -186,6 +186,7 @@ def test_bad_input_is_one_sentence() -> None:
         (lambda: rank(population, horizon=3), "a horizon of 3 steps"),
         (lambda: rank(population, outer_samples=1), "1 outer samples"),
         (lambda: rank(population, cost=lambda c: {"time": 2.0}), "'time', which has no rate"),
+        (lambda: rank(population, cost={}), "candidate 0 is missing in the mapping of costs"),
         (lambda: rank(population, cost=lambda c: 2.0, rate={"time": 2.0}), "costs a single number"),
         (lambda: rank(population, cost=lambda c: 2.0, rate=-1.0), "at least 0"),
         (lambda: rank(population, cost=lambda c: math.nan), "candidate 0 costs nan"),
