@@ -1,16 +1,19 @@
 """What a sweep costs: the overhead of a cell, and how well two workers divide runs, beside a bare loop.
 
 The runs are of the shipped pushes, as many as `--runs`. Results have to be equal whoever computes them; that
-of a backend which is not installed is left out.
+of a backend which is not installed is left out. What the machine allows is measured as well: two processes of
+which each computes half of the runs, with nothing between them.
 """
 
 from __future__ import annotations
 
+import multiprocessing
 import tempfile
 import time
 from contextlib import ExitStack
 from importlib.util import find_spec
 from pathlib import Path
+from threading import Barrier
 from typing import Any
 
 import torch
@@ -39,6 +42,29 @@ def nothing(cell: dict[str, int]) -> int:
     return cell["seed"]
 
 
+def computed(cells: list[dict[str, int]], begin: Barrier) -> None:
+    """A process's share of the runs, from when all others have begun as well."""
+    torch.set_num_threads(1)
+    run(dict(cells[0], seed=10_000))
+    begin.wait()
+    for cell in cells:
+        run(cell)
+
+
+def apart(cells: list[dict[str, int]], processes: int) -> float:
+    """Seconds of the runs in processes of their own."""
+    context = multiprocessing.get_context("spawn")
+    begin = context.Barrier(processes + 1)
+    each = [context.Process(target=computed, args=(cells[k::processes], begin)) for k in range(processes)]
+    for process in each:
+        process.start()
+    begin.wait()
+    begun = time.perf_counter()
+    for process in each:
+        process.join()
+    return time.perf_counter() - begun
+
+
 def timed(function: Any, cells: list[dict[str, int]], jobs: int, file: Path) -> tuple[float, dict[str, Any]]:
     """Seconds of a sweep, its workers begun before, and what it has kept."""
     list(swept(function, [dict(cell, seed=10_000 + k) for k, cell in enumerate(cells[:jobs])], jobs=jobs))
@@ -61,7 +87,9 @@ def main() -> None:
     bare = time.perf_counter() - begun
     ways = [("loky", 1), ("loky", 2), *((name, 2) for name, package in NEEDS.items() if find_spec(package))]
     lines: list[list[Any]] = [["bare loop", bare, 1.0, "", "", ""]]
-    rows: list[Row] = []
+    bound = bare / (2.0 * (seconds := apart(cells, 2)))
+    lines.append(["two processes", seconds, bare / seconds, bound, "", ""])
+    rows = [Row("two processes with nothing between them: efficiency", bound, "")]
     for backend, jobs in ways:
         with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
             stack.enter_context(workers(backend))
