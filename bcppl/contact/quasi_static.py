@@ -26,7 +26,7 @@ from bcppl.geometry.gap import Frames, PegGap, frames_of
 from bcppl.geometry.gap.peg_gap import Tables, measured
 from bcppl.geometry.gap.sharp_edges import dot
 from bcppl.geometry.parts import Part
-from bcppl.poses import quaternions
+from bcppl.poses.kernels import local, retract, rotation_matrix
 from bcppl.robot.commands import interpolated_command
 from bcppl.robot.motion import ProbeWindow
 
@@ -41,7 +41,7 @@ _ITERATIONS = 40  # of a blocked peg, for one command
 _REFUTED = 1e-6  # m
 _ALIKE = 0.99999  # cosine between the normals of two planes that count as one
 _PLANES = 4  # contacts that are remembered
-_CHUNK = 64  # pegs of a chunk of work, at least
+_CHUNK = 8  # pegs of a chunk of work
 _MEASURED = 0.0019  # m: larger gaps are upper bounds, because edges farther away are not measured
 
 
@@ -94,8 +94,25 @@ class QuasiStaticMotion:
         motion = torch.full((*command.shape[:2], 8), torch.nan, dtype=torch.float64)
         finite = torch.isfinite(part).all(dim=1) & torch.isfinite(command).all(dim=2).all(dim=1)
         if command.shape[1] and bool(finite.any()):
-            motion[finite] = _Integrator(self, part[finite], command[finite]).motion()
+            motion[finite] = self._motion(part[finite], command[finite])
         return motion
+
+    def _motion(self, part: Tensor, command: Tensor) -> Tensor:
+        turned = _angles(command[:, :-1, 3:], command[:, 1:, 3:])
+        moved = (command[:, 1:, :3] - command[:, :-1, :3]).norm(dim=-1) + self.reach * turned
+        moved = torch.cat([torch.zeros_like(moved[:, :1]), moved], dim=1)
+        free = _free(self, self.separation(part, command), turned)
+        frames, limits = frames_of(part), (self.step, self.friction, self.pressed)
+        rows, counts = np.empty((*command.shape[:2], 8)), np.zeros(len(part), dtype=np.int64)
+        path, lengths = command.numpy(), moved.numpy()
+
+        def work(first: int, last: int, tables: Tables) -> int:
+            return _followed(first, last, frames, path, lengths, free, tables, limits, rows, counts)
+
+        with self.gap.effort.measure() as effort:
+            self.gap.in_threads(work, len(part), _CHUNK)
+            effort.items += int(counts.sum())
+        return torch.from_numpy(rows)
 
     def separation(self, world_from_part: Tensor, world_from_peg: Tensor) -> Tensor:
         """Distances (N, K, 6) of a peg at poses (N, K, 7) from the planes of the part's bounding box."""
@@ -148,111 +165,108 @@ class WindowMotion:
         return [rows[k] for k in range(len(motions))]
 
 
-class _Integrator:
-    """The motion of N particles, integrated from command to command."""
+def _free(model: QuasiStaticMotion, separation: Tensor, turned: Tensor) -> Mask:
+    """Whether ways to commands lead past the part (N, T), by separations (N, T, 6) and angles (N, T - 1)."""
+    # A straight motion stays beyond a plane that both of its ends are beyond; a rotation sags.
+    apart = torch.minimum(separation[:, 1:], separation[:, :-1]).amax(dim=-1)
+    free = apart > model.reach * (1.0 - torch.cos(0.5 * turned))
+    return np.asarray(torch.cat([separation[:, :1].amax(dim=-1) > 0, free], dim=1))
 
-    def __init__(self, model: QuasiStaticMotion, world_from_part: Tensor, command: Tensor) -> None:
-        count = len(command)
-        self.model, self.part, self.command = model, frames_of(world_from_part), command
-        self.separation = model.separation(world_from_part, command)
-        # Each peg is alone at its one stamp, as `measured` has it.
-        self.peg = Frames(np.empty((count, 1, 3, 3)), command[:, :1, :3].numpy().copy())
-        self.blocked = torch.ones(count, dtype=torch.bool)  # until measured
-        # A lower bound of the distance to the part, by the last measurement and the motion since.
-        self.slack = torch.zeros(count, dtype=torch.float64)
-        self.gap = np.empty((count, 1)), np.empty((count, 1, 3)), np.empty((count, 1, 3))
-        self.known = np.zeros(count, dtype=np.bool_)  # that gap, where the peg is now
 
-    def motion(self) -> Tensor:
-        """(N, T, 8)."""
-        model, command, separation = self.model, self.command, self.separation
-        # A straight motion stays beyond a plane that both of its ends are beyond; a rotation sags.
-        apart = torch.minimum(separation[:, 1:], separation[:, :-1]).amax(dim=-1)
-        turned = _angles(command[:, :-1, 3:], command[:, 1:, 3:])
-        moved = (command[:, 1:, :3] - command[:, :-1, :3]).norm(dim=-1) + model.reach * turned
-        free = apart > model.reach * (1.0 - torch.cos(0.5 * turned))
-        still = torch.zeros(len(command), dtype=torch.float64)
-        rows = [self._follow(command[:, 0], still, separation[:, 0].amax(-1) > 0)]
-        for t in range(1, command.shape[1]):
-            count = 1
-            near = moved[:, t - 1][~(free[:, t - 1] & ~self.blocked)]
-            if len(near):
-                count = max(1, math.ceil(float(near.max()) / model.step))
-            for share in torch.arange(1, count + 1) / count:
-                goal = _interpolated(command[:, t - 1], command[:, t], float(share))
-                row = self._follow(goal, moved[:, t - 1] / count, free[:, t - 1])
-            rows.append(row)
-        return torch.stack(rows, dim=1)
+@compiled
+def _followed(
+    first: int,
+    last: int,
+    part: Frames,
+    command: Array,
+    moved: Array,
+    free: Mask,
+    tables: Tables,
+    limits: tuple[float, float, float],
+    rows: Array,
+    counts: Indices,
+) -> int:
+    """Set poses and contact (N, T, 8) of pegs from `first` to `last`, and how often each was measured.
 
-    def _follow(self, goal: Tensor, moved: Tensor, free: Tensor) -> Tensor:
-        """Poses and contact (N, 8) at a command (N, 7), whose surface moved by at most (N,) from the last."""
-        self.slack -= moved
-        near = self.blocked | ~(free | (self.slack > 0.0))
-        place = torch.from_numpy(self.peg.translation)[:, 0]
-        touches = torch.zeros(len(goal), dtype=torch.bool)
-        place[~near] = goal[~near, :3]
-        self.known &= near.numpy()
-        if bool(near.any()):
-            self._approach(near.numpy().nonzero()[0], goal)
-            distance = torch.from_numpy(self.gap[0])[near, 0]
-            off = (place - goal[:, :3])[near].norm(dim=1)
-            self.blocked[near] = off > _CONVERGED
-            touches[near] = (distance < _TOUCHES) | (off > 10.0 * _CONVERGED)
-            self.slack[near] = distance.clamp(max=_MEASURED)
-        return torch.cat([place, goal[:, 3:], touches[:, None].to(torch.float64)], dim=1)
+    They follow commands (N, T, 7), to which their surfaces move by at most (N, T) from the last, and which
+    lead past the part where they are `free` (N, T). It returns what `measured` does.
+    """
+    searched, stamps, room = 0, command.shape[1], _room()
+    gap = np.empty((1, 1)), np.empty((1, 1, 3)), np.empty((1, 1, 3))
+    peg = Frames(np.empty((1, 1, 3, 3)), np.empty((1, 1, 3)))
+    tangent, goal, turn = np.empty((1, 6)), np.empty((1, 7)), np.empty((1, 3, 3))
+    place, target = peg.translation[0, 0], goal[0, :3]
+    for n in range(first, last):
+        solid = Frames(part.rotation[n : n + 1], part.translation[n : n + 1])
+        blocked, known, touches = True, False, False  # until measured
+        slack = 0.0  # a lower bound of the distance to the part, by the last measurement and the motion since
+        peg.rotation[:], place[:] = np.nan, command[n, 0, :3]
+        for t in range(stamps):
+            before, here = command[n, max(t - 1, 0)][None], command[n, t][None]
+            local(before, here, tangent)
+            turns = np.any(here[0, 3:] != before[0, 3:])
+            steps = 1 if free[n, t] and not blocked else max(1, math.ceil(moved[n, t] / limits[0]))
+            for step in range(1, steps + 1):
+                goal[:] = here
+                if step < steps:
+                    retract(before, step / steps * tangent, goal)
+                    if not turns:  # but for rounding, by which its gap would be unknown
+                        goal[0, 3:] = here[0, 3:]
+                slack -= moved[n, t] / steps
+                if not blocked and (free[n, t] or slack > 0.0):
+                    place[:], known, touches = target, False, False
+                    continue
+                rotation_matrix(goal, goal, turn)
+                known = known and bool(np.all(turn[0] == peg.rotation[0, 0]))
+                peg.rotation[0, 0] = turn[0]
+                found, known, measurements = _approached(solid, peg, target, tables, limits, gap, known, room)
+                searched, counts[n] = searched + found, counts[n] + measurements
+                off = _apart(place, target)
+                blocked = off > _CONVERGED
+                touches = gap[0][0, 0] < _TOUCHES or off > 10.0 * _CONVERGED
+                slack = min(gap[0][0, 0], _MEASURED)
+            rows[n, t, :3], rows[n, t, 3:7], rows[n, t, 7] = place, here[0, 3:], touches
+    return searched
 
-    def _approach(self, chosen: Indices, goal: Tensor) -> None:
-        """Move the chosen pegs towards their commands, of (N, 7), and measure their gaps."""
-        model, part, peg, gap, known = self.model, self.part, self.peg, self.gap, self.known
-        turn = frames_of(goal).rotation[chosen]
-        known[chosen] &= (turn == peg.rotation[chosen, 0]).all(axis=(1, 2))
-        peg.rotation[chosen, 0] = turn
-        target, limits = goal[:, :3].numpy(), (model.step, model.friction, model.pressed)
-        counts = np.zeros(len(chosen), dtype=np.int64)
 
-        def work(first: int, last: int, tables: Tables) -> int:
-            on, own = chosen[first:last], counts[first:last]
-            return _approached(on, part, peg, target, tables, limits, gap, known, own)
-
-        with model.gap.effort.measure() as effort:
-            model.gap.in_threads(work, len(chosen), _CHUNK)
-            effort.items += int(counts.sum())
+@compiled
+def _room() -> tuple[Array, Array, Array, Mask, Array]:
+    """Planes that are remembered: normals, offsets and where they were seen; and room for `_step`."""
+    normals, seen = np.empty((_PLANES, 3)), np.empty((_PLANES, 3))
+    return normals, np.empty(_PLANES), seen, np.empty(_PLANES, np.bool_), np.empty(3)
 
 
 @compiled
 def _approached(
-    chosen: Indices,
     part: Frames,
     peg: Frames,
     target: Array,
     tables: Tables,
     limits: tuple[float, float, float],
     gap: tuple[Array, Array, Array],
-    known: Mask,
-    counts: Indices,
-) -> int:
-    """Move the chosen pegs towards their targets, of (N, 3), until they are there or at rest.
+    known: bool,
+    room: tuple[Array, Array, Array, Mask, Array],
+) -> tuple[int, bool, int]:
+    """Move a peg (1, 1) towards a target until it is there or at rest, and measure its gap (1, 1).
 
-    `peg` and `gap` (N, 1) are set, `known`, and how often each was measured. It returns what `measured` does.
+    `known` is whether that is measured already. It returns what `measured` does, `known` and how often that
+    was called.
     """
-    searched = 0
-    normals, offsets, seen = np.empty((_PLANES, 3)), np.empty(_PLANES), np.empty((_PLANES, 3))
-    active, normal, best = np.empty(_PLANES, np.bool_), np.empty(3), np.empty(3)
-    for k in range(len(chosen)):
-        n = chosen[k]
-        normals[:], offsets[:], seen[:] = 0.0, 0.0, np.inf
-        place, planes = peg.translation[n, 0], (normals, offsets, seen)
-        for iteration in range(_ITERATIONS):
-            if not known[n]:
-                searched += measured(n, n + 1, part, peg, tables, *gap)
-                counts[k] += 1
-            for axis in range(3):
-                normal[axis] = dot(part.rotation[n, axis], gap[2][n, 0])
-            converged = _CONVERGED if iteration < _PATIENT else _ROUGHLY
-            known[n] = _step(place, target[n], gap[0][n, 0], normal, planes, limits, converged, active, best)
-            if known[n]:
-                break
-    return searched
+    searched, measurements, normal = 0, 0, np.empty(3)
+    normals, offsets, seen, active, best = room
+    normals[:], offsets[:], seen[:] = 0.0, 0.0, np.inf
+    place, planes = peg.translation[0, 0], (normals, offsets, seen)
+    for iteration in range(_ITERATIONS):
+        if not known:
+            searched += measured(0, 1, part, peg, tables, *gap)
+            measurements += 1
+        for axis in range(3):
+            normal[axis] = dot(part.rotation[0, axis], gap[2][0, 0])
+        converged = _CONVERGED if iteration < _PATIENT else _ROUGHLY
+        known = _step(place, target, gap[0][0, 0], normal, planes, limits, converged, active, best)
+        if known:
+            break
+    return searched, known, measurements
 
 
 @compiled
@@ -326,17 +340,3 @@ def _thickness(part: Part) -> float:
 def _angles(first: Tensor, second: Tensor) -> Tensor:
     """Angles (...) between quaternions (..., 4)."""
     return 2.0 * torch.acos((first * second).sum(dim=-1).abs().clamp(max=1.0))
-
-
-def _interpolated(first: Tensor, second: Tensor, share: float) -> Tensor:
-    """Poses (N, 7) between two: translations linear, rotations along the geodesic."""
-    if share == 1.0:
-        return second
-    place = torch.lerp(first[:, :3], second[:, :3], share)
-    if torch.equal(first[:, 3:], second[:, 3:]):
-        return torch.cat([place, first[:, 3:]], dim=1)
-    start, stop = poses.quaternion_xyzw(first), poses.quaternion_xyzw(second)
-    stop = torch.where((start * stop).sum(dim=-1, keepdim=True) < 0.0, -stop, stop)
-    step = share * quaternions.rotation_vector(quaternions.product(quaternions.conjugate(start), stop))
-    turned = quaternions.product(start, quaternions.from_rotation_vector(step))
-    return poses.from_translation_quaternion_xyzw(place, turned)

@@ -170,10 +170,11 @@ def test_particles_and_commands_together_are_each_alone_and_motions_of_the_world
     rules, length = over_a_hole()
     rng = np.random.default_rng(0)
     part = poses.retract(poses.identity(6), torch.from_numpy(1e-3 * rng.normal(size=(6, 6))))
+    starts = zip(rng.uniform(-0.01, 0.01, 6), (0.0015, 0.003, 0.006, 0.01, 0.02, 0.03), strict=True)
     commands = torch.stack(
         [
-            way((x, 0.005, 0.003), (x, 0.005, -0.004), (x + 0.006, 0.007, -0.004), tip=length)
-            for x in rng.uniform(-0.01, 0.01, 6)
+            way((x, 0.005, height), (x, 0.005, -0.004), (x + 4 * height, 0.007, -0.004), tip=length)
+            for x, height in starts
         ]
     )
     together = rules(part, commands)
@@ -318,6 +319,17 @@ def test_stamps_far_apart_lead_through_no_wall() -> None:
         assert float(on_a_block().gap(poses.identity(1), peg[:, :7]).distance.min()) > -2e-7
         assert peg[-1, 7] == 1.0
         assert float(peg[-1, 2]) > LENGTH - 2e-7 if not end[0] else float(peg[-1, 0]) < -0.03
+
+
+def test_a_peg_that_turned_far_away_stops_as_it_is_turned_then() -> None:
+    lean = turned(0.3, 0.1, 0.0)[0, 3:]
+    command = torch.cat([way((0, 0, 0.08)), way((0, 0, 0.08), (0, 0, 0.03), (0, 0, -0.03), count=1)])
+    leant = command.clone()
+    leant[:, 3:] = lean
+    command[1:, 3:] = lean
+    peg = on_a_block()(poses.identity(1), command)[0]
+    torch.testing.assert_close(peg[-1], on_a_block()(poses.identity(1), leant)[0, -1], atol=1e-6, rtol=0.0)
+    assert abs(float(on_a_block().gap(poses.identity(1), peg[-1:, :7]).distance)) < 1e-6
 
 
 def test_its_turn_is_the_commands() -> None:
