@@ -19,13 +19,13 @@ from torch import Tensor
 
 from bcppl.arguments import number_within, whole_number
 from bcppl.arrays import Array, ArrayRecord, Mask
+from bcppl.compiled import compiled
 from bcppl.contact.sensing.load import ToolLoad, refuse_millimetres
 from bcppl.contact.sensing.surface import PegSurface
 from bcppl.contact.touch import Touch
 from bcppl.errors import InputError
+from bcppl.geometry.gap.sharp_edges import dot
 from bcppl.geometry.parts import Part
-
-_BATCH = 4096  # lines whose distances to all edges are held at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,34 +199,11 @@ class ContactSensing:
         entry[hit] = origin[hit] + reach[:, None] * direction[hit]
         in_cone = np.zeros(len(point), dtype=bool)
         in_cone[hit] = -cosine >= self._cone
-        entry[~in_cone] = self._nearest_edge(point[~in_cone], direction[~in_cone])
+        entry[~in_cone] = _nearest_on_edges(
+            point[~in_cone], direction[~in_cone], self._edges, self._cone, self.miss_tolerance
+        )
         locations[near] = entry
         return locations
-
-    def _nearest_edge(self, point: Array, direction: Array) -> Array:
-        """Points (M, 3) of the convex hull's edges nearest to lines (M, 3), NaN beyond the tolerance.
-
-        Only edges that the force pushes into the peg, within the friction cone of a normal there, count.
-        """
-        start, extent, normals = self._edges
-        nearest = np.full((len(point), 3), np.nan)
-        for first in range(0, len(point), _BATCH):
-            p, d = point[first : first + _BATCH, None], direction[first : first + _BATCH, None]
-            gap = start - p
-            # In the plane across the line, the line is a point and an edge a shorter edge.
-            gap = gap - np.sum(gap * d, axis=-1, keepdims=True) * d
-            edge = extent - np.sum(extent * d, axis=-1, keepdims=True) * d
-            length = np.sum(edge * edge, axis=-1)
-            share = np.clip(-np.sum(gap * edge, axis=-1) / np.maximum(length, 1e-30), 0.0, 1.0)
-            distance = np.linalg.norm(gap + share[..., None] * edge, axis=-1)
-            pushed = np.einsum("ekj,mj->mek", -normals, d[:, 0]).max(axis=-1)
-            distance[pushed < self._cone] = np.inf
-            best = distance.argmin(axis=1)
-            rows = np.arange(len(best))
-            points = start[best] + share[rows, best][:, None] * extent[best]
-            points[distance[rows, best] > self.miss_tolerance] = np.nan
-            nearest[first : first + _BATCH] = points
-        return nearest
 
     def measure(self, touches: Sequence[Touch]) -> list[tuple[Tensor, Tensor]]:
         """Contact locations (T, 3) in the peg's frame, its poses (T, 7), of consecutive windows of one probe.
@@ -300,3 +277,33 @@ class ContactSensing:
             wrench = wrench - self.load.weight(pose)
         cleaned, state = self.clean(wrench[None], state)
         return cleaned[0], state
+
+
+@compiled
+def _nearest_on_edges(
+    point: Array, direction: Array, edges: tuple[Array, Array, Array], cone: float, tolerance: float
+) -> Array:
+    """Points (M, 3) of edges, of `ContactSensing._edges`, nearest to lines (M, 3), NaN beyond the tolerance.
+
+    Only edges that the force pushes into the peg, within the friction cone of a normal there, count.
+    """
+    start, extent, normals = edges
+    nearest, gap, edge = np.full((len(point), 3), np.nan), np.empty(3), np.empty(3)
+    for m in range(len(point)):
+        line, least = direction[m], tolerance
+        for e in range(len(start)):
+            pushed = -min(dot(normals[e, 0], line), dot(normals[e, 1], line), dot(normals[e, 2], line))
+            if pushed < cone:
+                continue
+            # In the plane across the line, the line is a point and an edge a shorter edge.
+            beyond, along = dot(start[e], line) - dot(point[m], line), dot(extent[e], line)
+            for axis in range(3):
+                gap[axis] = start[e, axis] - point[m, axis] - beyond * line[axis]
+                edge[axis] = extent[e, axis] - along * line[axis]
+            share = min(max(-dot(gap, edge) / max(dot(edge, edge), 1e-30), 0.0), 1.0)
+            gap += share * edge
+            distance = np.sqrt(dot(gap, gap))
+            if distance <= least and (distance < least or np.isnan(nearest[m, 0])):
+                least = distance
+                nearest[m] = start[e] + share * extent[e]
+    return nearest
