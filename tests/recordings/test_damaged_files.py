@@ -127,6 +127,13 @@ def test_a_file_without_a_checksum_is_read_elsewhere_first(
     assert read == [shipped]
 
 
+def test_a_file_that_takes_too_long_is_not_called_damaged_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(hdf5, "_read_before", set())
+    monkeypatch.setattr(hdf5, "WAIT", 1e-4)
+    sentence = refusal(load, MODELS / "recordings/peg_probe.h5")
+    assert "the machine is busy or the file is damaged; try again" in sentence
+
+
 def test_a_recording_of_an_earlier_version_is_read_to_the_bit(tmp_path: Path) -> None:
     path = tmp_path / "earlier.h5"
     save(full(), path)
