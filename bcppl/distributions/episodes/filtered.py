@@ -6,10 +6,11 @@ import math
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from bcppl.devices import is_on_host, on_device_of
+from bcppl.devices import is_on_host, numbers, on_device_of
 from bcppl.distributions.episodes.couples import MeasuresWitness
 from bcppl.distributions.episodes.displaced import Lines, lines_at
 from bcppl.distributions.episodes.filter.alike import AlikeBranches, begun_alike, filtered_alike
@@ -26,6 +27,7 @@ from bcppl.distributions.manifold import FARTHEST, ContactManifold
 from bcppl.distributions.parameters import NONNEGATIVE, POSITIVE
 
 _FAR = 4.0  # standard deviations
+_ASTRAY, _AWAY = 5.0, 0.001  # standard deviations, and m, beyond both of which a contact is none at a pose
 _REMEMBERED = 5  # a window's rows are those that the next one is given
 
 
@@ -151,8 +153,26 @@ class FilteredEpisodes(PredictedEpisodes):
         lines = self._lines(rows, errors)
         if not free:
             return filtered(begin, prior, segments, lines, rows[:, FORCE])
-        trust = self._trust(lines, rows) if self.blur else None
+        trust = self._trust(lines, rows) if self.blur else self._not_astray(lines, rows)
         return filtered(begin, prior, segments, lines, rows[:, FORCE], lines.gradient, trust)
+
+    def _not_astray(self, lines: Lines, rows: Tensor) -> Tensor:
+        """Factors (N, D, R) of contacts' errors: 0 of pieces that are far off at these poses, 1 of others.
+
+        Where the pose is free to move, a contact that is false may be the first to determine a direction, so
+        that it seems to be none: those which are true would then be the outliers.
+        """
+        segments, branches = segments_of(rows, self._row_errors, self._every), self.branches(rows).on_host
+        contact = segments.contact == 1
+        first, count = segments.first[contact], (segments.last - segments.first)[contact]
+        surprise = (branches.weights[..., None] * branches.squared).sum(axis=1) / count  # (N, pieces)
+        away = np.add.reduceat(np.abs(numbers(lines.distance)), segments.first, axis=1)[:, contact] / count
+        astray = (surprise > _ASTRAY**2) & (away > _AWAY)
+        factors = np.ones((len(astray), len(lines.late), len(rows)))
+        for piece in astray.any(axis=0).nonzero()[0]:
+            own = slice(first[piece], first[piece] + count[piece])
+            factors[astray[:, piece], :, own] = 0.0
+        return on_device_of(torch.from_numpy(factors), self.pose)
 
     @property
     def _row_errors(self) -> RowErrors:

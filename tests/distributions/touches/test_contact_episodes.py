@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from collections.abc import Sequence
@@ -215,11 +216,16 @@ def test_quadratic_is_the_gradient_and_nearly_the_curvature() -> None:
     scale = torch.tensor([1e-4] * 3 + [3e-3] * 3, dtype=torch.float64)
     given = MIXED.clone()
     given[:2, GIVEN] = 1.0
+    # The first contact is false, and determines where the plane would be.
+    false = rows_at(
+        [5e-3, *MIXED[:, 2].tolist()], [1, *MIXED[:, 7].tolist()], [0, *(MIXED[:, 11] + 1).tolist()]
+    )
     one = (Hypothesis(0.0, COMPLIANCE),)
-    for value in (MIXED, given):
+    for value in (MIXED, given, false):
         pose = around(1, 1, 1e-5, 1e-4)
-        stated = site(pose, 8, hypotheses=one).quadratic(value)
-        gradient, bend = differences(lambda p: site(p, 8, hypotheses=one), value, pose, step)
+        stated = site(pose, len(value), hypotheses=one).quadratic(value)
+        here = functools.partial(site, stamps=len(value), hypotheses=one)
+        gradient, bend = differences(here, value, pose, step)
         size = float((gradient * scale).abs().max())
         assert float(((stated.gradient[0] - gradient) * scale).abs().max()) < 0.12 * size
         information, curved = stated.information[0] * scale[:, None] * scale, bend * scale[:, None] * scale
