@@ -122,8 +122,8 @@ def planned(
     recording: Recording,
     constraints: Sequence[Constraint],
     table: float | None,
-    inside: tuple[float, float] | None,
     seed: int,
+    inside: tuple[float, float] | None = None,
 ) -> Candidates:
     """The candidates that satisfy the constraints, a table's height (m) among them.
 

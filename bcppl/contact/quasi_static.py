@@ -38,6 +38,7 @@ _CONVERGED = 1e-7  # m: the step at which a blocked peg is at rest; a fifth of i
 _ROUGHLY = 1e-5  # m: the same after `_PATIENT` iterations
 _PATIENT = 10
 _ITERATIONS = 40  # of a blocked peg, for one command
+_DEEP = 5e-5  # m: a step that leads deeper into the part is halved
 _REFUTED = 1e-6  # m
 _ALIKE = 0.99999  # cosine between the normals of two planes that count as one
 _PLANES = 4  # contacts that are remembered
@@ -252,7 +253,7 @@ def _approached(
     `known` is whether that is measured already. It returns what `measured` does, `known` and how often that
     was called.
     """
-    searched, measurements, normal = 0, 0, np.empty(3)
+    searched, measurements, normal, outside, last = 0, 0, np.empty(3), False, np.empty(3)
     normals, offsets, seen, active, best = room
     normals[:], offsets[:], seen[:] = 0.0, 0.0, np.inf
     place, planes = peg.translation[0, 0], (normals, offsets, seen)
@@ -260,6 +261,12 @@ def _approached(
         if not known:
             searched += measured(0, 1, part, peg, tables, *gap)
             measurements += 1
+        if gap[0][0, 0] >= -_DEEP:
+            outside, last[:] = True, place
+        elif outside:
+            # What it has met is not known yet, and from deep inside the shortest way out may be another one.
+            place[:] = 0.5 * (place + last)
+            continue
         for axis in range(3):
             normal[axis] = dot(part.rotation[0, axis], gap[2][0, 0])
         converged = _CONVERGED if iteration < _PATIENT else _ROUGHLY

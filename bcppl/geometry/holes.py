@@ -53,8 +53,10 @@ def hole_of(part: Part, inside: tuple[float, float] | None = None, peg: Part | N
     """The hole in a part's top, from cross sections of its mesh between the levels of its vertices.
 
     Args:
-        part: its z axis points out of its top; the walls of its hole are parallel to z, except in a chamfer.
-        inside: (x, y) of a point in the hole, metres in the part's frame; needed where there are several.
+        part: its z axis points out of its top. Of a hole whose walls are not parallel to z, below its
+            chamfer, what is left straight down counts.
+        inside: (x, y) of a point in the hole, down to its end, metres in the part's frame; needed where there
+            are several.
         peg: that is to go in: the hole ends where the peg no longer fits, at a drill's point or at the floor
             of a counterbore. Without one, or with one that does not fit at all, it ends where it is closed.
 
@@ -63,7 +65,8 @@ def hole_of(part: Part, inside: tuple[float, float] | None = None, peg: Part | N
             given.
     """
     levels = _levels(part)
-    sections = [_rings(part, 0.5 * (a + b)) for a, b in itertools.pairwise(levels)]
+    layers = list(itertools.pairwise(levels))
+    sections = [_rings(part, 0.5 * (a + b)) for a, b in layers]
     if not sections or not sections[0]:
         raise InputError(
             f"part {part.name!r} has no hole in its top; give a part with a hole along its z axis, or turn "
@@ -75,25 +78,18 @@ def hole_of(part: Part, inside: tuple[float, float] | None = None, peg: Part | N
         if not first:
             raise InputError(f"part {part.name!r} has no hole around {inside} m; give a point inside one.")
     if len(first) > 1:
-        places = ", ".join(f"({p.centroid.x:.4f}, {p.centroid.y:.4f})" for p in first)
         raise InputError(
-            f"part {part.name!r} has {len(first)} holes in its top, at {places} m; choose one with `inside`."
+            f"part {part.name!r} has {len(first)} holes in its top, at {_places(first)} m; choose one with "
+            "`inside`."
         )
-    # The middle of an outline that is bent may lie outside it.
-    middle, rings = first[0].centroid, []
-    if not first[0].contains(middle):
-        middle = first[0].representative_point()
-    for section in sections:
-        around = [ring for ring in section if ring.contains(middle)]
-        if not around:
-            break
-        rings.append(around[0])
+    middle = _middle(first[0]) if inside is None else shapely.Point(inside)
+    rings: list[shapely.Polygon] = []
 
     def down_to(count: int) -> Hole:
         """The hole down to the lower end of a number of sections."""
         least = min(ring.area + _WIDER * ring.length for ring in rings[:count])
         narrowest = next(k for k, ring in enumerate(rings) if ring.area <= least)
-        ring, top = rings[narrowest], levels[0]
+        ring, top = _room(part, rings[narrowest], layers[narrowest:count]), levels[0]
         centre = np.array([ring.centroid.x, ring.centroid.y, top])
         return Hole(
             np.concatenate([centre, [1.0, 0.0, 0.0, 0.0]]),
@@ -103,6 +99,23 @@ def hole_of(part: Part, inside: tuple[float, float] | None = None, peg: Part | N
             count == len(sections),
         )
 
+    for section in sections:
+        around = [ring for ring in section if ring.contains(middle)]
+        if not around and rings and peg is not None and inside is None:
+            # In the floor of a counterbore, beside its middle.
+            for ring in [ring for ring in section if rings[-1].contains(ring.representative_point())]:
+                rings.append(ring)
+                around += [ring] if _takes(down_to(len(rings)), peg) else []
+                rings.pop()
+            if len(around) > 1:
+                raise InputError(
+                    f"part {part.name!r} has {len(around)} holes below its top that take the peg, at "
+                    f"{_places(around)} m; choose one with `inside`."
+                )
+            middle = _middle(around[0]) if around else middle
+        if not around:
+            break
+        rings.append(around[0])
     counts = range(1, len(rings) + 1)
     taking = 0 if peg is None else bisect_left(counts, True, key=lambda n: not _takes(down_to(n), peg))
     return down_to(taking or len(rings))
@@ -127,7 +140,7 @@ def fit_in(hole: Hole, peg: Part) -> Fit:
         InputError: the peg fits at no yaw, or has no lower end.
     """
     low = float(peg.vertices[:, 2].min())
-    outline = _outline(peg, hole.depth)
+    outline = lowest_outline(peg, hole.depth)
     held = np.array([outline.centroid.x, outline.centroid.y])
     centred = translate(outline, *-held)
 
@@ -158,6 +171,27 @@ def fit_in(hole: Hole, peg: Part) -> Fit:
     return Fit(np.concatenate([-shift, [-low], rotation]), clearance)
 
 
+def _middle(ring: shapely.Polygon) -> shapely.Point:
+    """A point inside a ring: its centroid, which of one that is bent may lie outside."""
+    return ring.centroid if ring.contains(ring.centroid) else ring.representative_point()
+
+
+def _places(rings: list[shapely.Polygon]) -> str:
+    return ", ".join(f"({p.centroid.x:.4f}, {p.centroid.y:.4f})" for p in rings)
+
+
+def _room(part: Part, ring: shapely.Polygon, layers: list[tuple[float, float]]) -> shapely.Polygon:
+    """What a hole of a ring leaves straight down some layers whose walls lean; the ring where none does."""
+    room = ring
+    for high, low in layers:
+        for height in (high - _LEVEL, low + _LEVEL):
+            ends = [end for end in _rings(part, height) if end.intersects(room)]
+            narrower = [room.intersection(end) for end in ends]
+            if narrower and min(each.area for each in narrower) < room.area - _WIDER * room.length:
+                room = max(shapely.get_parts(min(narrower, key=lambda each: each.area)), key=shapely.area)
+    return room if isinstance(room, shapely.Polygon) and not room.is_empty else ring
+
+
 def _takes(hole: Hole, peg: Part) -> bool:
     try:
         fit_in(hole, peg)
@@ -166,7 +200,7 @@ def _takes(hole: Hole, peg: Part) -> bool:
     return True
 
 
-def _outline(peg: Part, length: float) -> shapely.Polygon:
+def lowest_outline(peg: Part, length: float) -> shapely.Polygon:
     """The outline of a peg's lowest part of a length (m), in its x-y plane: the union of its sections."""
     top = float(peg.vertices[:, 2].min()) + length - _LEVEL  # a collar that rests on the part is not of it
     lowest = trimesh.intersections.slice_mesh_plane(peg.mesh, [0.0, 0.0, -1.0], [0.0, 0.0, top])

@@ -35,6 +35,10 @@ class Approximation(Protocol):
         """Whether a measurement is made too far from the part to depend on its pose."""
         return False
 
+    def share_inside(self, action: Any) -> float:
+        """How much of it lies where the prior's limits do not matter."""
+        return 1.0
+
     def screens(self, action: Any) -> bool:
         """Whether it has a cheap likelihood of a measurement that is simulated."""
         return False

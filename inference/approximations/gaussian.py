@@ -18,6 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from bcppl import poses
 from bcppl.devices import HOST, current_device, on_host, to_device
 from bcppl.distributions.pose_normals import (
     GaussianMixture,
@@ -49,6 +50,8 @@ from bcppl.sensors.capabilities import Approximated, Contacts, EntersHole, FitsP
 # A mode that particles miss: of at least this share of all modes' weight, at most so many nats less probable
 # than the best particle, and no particle within so many squared standard deviations.
 _SHARE, _LESS, _APART = 0.05, 5.0, 50.0
+# Draws of a normal, the same in every run.
+_DRAWS = torch.randn(128, 6, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
 _BETTER = 3.0  # nats by which a particle is more probable than all modes, which have been lost
 _FOLLOWED = 32  # particles from which modes are searched for
 UNSURE = 0.0005  # m: beyond this standard deviation the contact may be with another place of the part
@@ -241,6 +244,17 @@ class GaussianApproximation:
             return False
         value = observations.get(sensor.address(number))
         return value is not None and not sensor.is_informative(action, value, self.prior.centers)
+
+    @on_host()
+    def share_inside(self, action: Any) -> float:
+        """How much of it lies where the prior's limits do not matter, before a measurement."""
+        if self.adapted is None and isinstance(self.scene.sensor(action), FitsPose):
+            return 1.0  # its conditional has the same limits
+        centers, covariances, log_weights = self.mixture
+        drawn = poses.exp(centers[:, None], _DRAWS @ torch.linalg.cholesky(covariances).transpose(-1, -2))
+        prior = self.scene.prior
+        inside = prior.log_prob(drawn) >= prior.log_prob(prior.center)
+        return float(log_weights.softmax(dim=0) @ inside.to(torch.float64).mean(dim=1))
 
     def screens(self, action: Any) -> bool:
         """Whether a measurement is simulated, and what is approximated is a cheap likelihood of it."""

@@ -68,6 +68,9 @@ ASKED = 4  # particles that are evaluated first for that
 # Particles and copies where images leave several modes: of 75 particles 20 stay effective, too few for the
 # modes' shares.
 SEVERAL = 1800
+# Of an approximation, where a prior's limits do not matter: a box is no Gaussian, and particles in its
+# corners had too little weight, for any number of them. Where less lies inside, the measurement is tempered.
+INSIDE = 0.9
 # Sweeps are made until the poses are displaced by so many variances, and no more than so many: one displaces
 # them by .2 to 1 where touches tell them, and by less along a bent ridge such as a peg wedged in a hole
 # leaves. There particles died out along it from window to window, and what was left was sure of a part.
@@ -79,7 +82,8 @@ DISTINCT = 0.75
 
 def gaussian_pair(before: Any, after: Any, action: Any) -> Pair:
     """Forward and backward kernels of one measurement, of Gaussian approximations without and with it."""
-    return Pair(forward_kernel(before, after, action), backward_kernel(before, after, action))
+    forward, backward = forward_kernel(before, after, action), backward_kernel(before, after, action)
+    return Pair(forward, backward, inside=before.share_inside(action) == 1.0)
 
 
 def gaussian_proposals(approximation: Any) -> Sequence[Program]:
@@ -191,6 +195,8 @@ def guided(
             assimilated = assimilate_screened(
                 population, before, observed, kernels, cheaply, threshold, least
             )
+        elif before.share_inside(action) < INSIDE:
+            assimilated = None
         else:
             assimilated = assimilate(population, observed, kernels, least)
         if assimilated is None:

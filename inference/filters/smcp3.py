@@ -6,7 +6,9 @@ the backward program how it was moved; each returns the choices of the other tha
 move is p(new) L(backward choices | new) |det J| / (p(old) K(forward choices | old)), with J the Jacobian of
 the map from (old values, forward choices) to (new values, backward choices) (theorem 2 of the paper), in the
 coordinates of the densities' base measures (`bcppl.inference.kernels.jacobian`). With fixed programs the
-estimate of the evidence is unbiased.
+estimate of the evidence is unbiased, unless the backward program chooses values that are impossible given
+other latent values: limits that are the same for all particles are seen to
+(`bcppl.inference.filters.conditioned_backward`).
 
     def forward(trace):
         shift = pyro.sample("shift", dist.Normal(0.5 * trace["y_3"], 0.2))
@@ -30,6 +32,7 @@ import torch
 from torch import Tensor
 
 from bcppl.errors import InputError
+from bcppl.inference.filters.conditioned_backward import log_conditioned
 from bcppl.inference.filters.step import Observed, StepFunction, StepInfo, Stepped
 from bcppl.inference.kernels.halving import halved, halves
 from bcppl.inference.kernels.jacobian import (
@@ -75,11 +78,14 @@ class Pair:
         backward: reads the new trace.
         check: check, at every move, that the backward program undoes the forward one, that the Jacobians of
             both cancel, and that particles are not mixed.
+        inside: whether the backward program is known to choose what priors with limits allow. Otherwise it is
+            conditioned on that (`bcppl.inference.filters.conditioned_backward`).
     """
 
     forward: Proposal
     backward: Proposal
     check: bool = False
+    inside: bool = False
 
 
 def move_and_weight(
@@ -114,7 +120,10 @@ def move_and_weight(
     whole: Trace | None = None
     for k, mine in enumerate(parts):
         forward, backward = _fitted(pair, population[parts[-1 - k]])
-        trace, gained = moved_trace(forward, backward, population.trace[mine], observed, pair.check, ratio)
+        old = population.trace[mine]
+        trace, gained = moved_trace(forward, backward, old, observed, pair.check, ratio)
+        if not (pair.inside or (observed is not None and isinstance(old, SeriesTrace))):
+            gained = gained + log_conditioned(backward, old, trace, old.choices, _old_values)
         log_factor[mine] = gained
         if whole is None:
             index = torch.zeros(count, dtype=torch.int64)
@@ -241,6 +250,11 @@ def _updated(
     else:
         updated = update(old, values, args=observed.args, observations=observed.observations)
     return updated.trace, ratio(updated)
+
+
+def _old_values(chosen: Trace, latent: Values) -> Values:
+    """The old values that a backward program has chosen."""
+    return _read(chosen.result, chosen.choices, latent, list)[0]
 
 
 def refuse_observed_choices(which: str, choices: Values, seen: Trace | Anticipated) -> None:

@@ -74,6 +74,7 @@ _REST = 0.15  # s before any motion, for the tare
 _SETTLE = 0.15  # s between the press and the search
 _SUNK = 0.001  # m below the chamfer at which a peg is in a hole, or half of what is left of a shallow one
 _KNOTS = 16  # per turn of the spiral, at least
+_RIM = 1e-4  # m above its tip to which a peg's rim reaches
 _SHRINK = 0.98  # of a spiral that takes too long, until it does not
 
 
@@ -103,6 +104,18 @@ def hole_estimate(belief: Belief, hole: Hole, fit: Fit) -> HoleEstimate:
     return HoleEstimate(mode.mass, world_from_hole, weighted_covariance(away, seen.weights))
 
 
+def _height_deviation(belief: Belief, hole: Hole, fit: Fit, peg: Part) -> float:
+    """Standard deviation (m) of the height of the part's top under the rim of a peg over its hole."""
+    part_from_hole, low = torch.from_numpy(hole.part_from_hole), float(peg.vertices[:, 2].min())
+    mode = belief.modes()[0]
+    part_from_peg = poses.compose(part_from_hole, torch.from_numpy(fit.hole_from_peg))
+    seen = mode.belief.relative(poses.compose(mode.mean, part_from_peg))
+    rim = torch.from_numpy(peg.vertices[peg.vertices[:, 2] < low + _RIM].copy())
+    under = poses.transform(part_from_peg, rim)
+    heights = poses.transform(poses.inverse(seen.mean), poses.transform(seen.world_from_part, under))[..., 2]
+    return float(torch.sqrt(seen.weights @ (heights - seen.weights @ heights) ** 2).max())
+
+
 def insertion_plan(
     belief: Belief,
     part: Part,
@@ -126,7 +139,7 @@ def insertion_plan(
     hole = hole_of(part, peg=peg) if hole is None else hole
     fit = fit_in(hole, peg)
     _, world_from_hole, covariance = hole_estimate(belief, hole, fit)
-    height = max(0.001, chosen.standard_deviations * float(covariance[2, 2].sqrt()))
+    height = max(0.001, chosen.standard_deviations * _height_deviation(belief, hole, fit, peg))
     times, tips, manners = _descent(chosen, height)
     spiral_times, spiral = _spiral(covariance[:2, :2].numpy(), fit.clearance, chosen)
     times = np.concatenate([times, times[-1] + spiral_times])

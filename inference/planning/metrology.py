@@ -8,15 +8,18 @@ that leans and turns while it presses touches with several of its own points, so
 from __future__ import annotations
 
 import math
+import warnings
 from typing import NamedTuple
 
 import numpy as np
 import shapely
 
+from bcppl import poses
 from bcppl.arguments import number_within
 from bcppl.arrays import Array
 from bcppl.beliefs import Belief
 from bcppl.errors import InputError
+from bcppl.geometry.holes import lowest_outline
 from bcppl.geometry.parts import Part
 from bcppl.inference.planning.faces import Side, TopPoints, points_on_top, section, sides
 from bcppl.inference.planning.waypoints import (
@@ -33,6 +36,10 @@ from bcppl.robot.plan import Manner, Plan
 
 _ABOVE = 0.06  # m above the top where the plan begins
 _AWAY = 0.002  # m from the part on the way around it
+_DEPTHS = (1.0, 0.5, 0.25)  # shares of the depth at which sides are touched that are tried
+_OVERHANG, _SECTIONS = 0.0005, 6  # m by which what is above a side may stand out, and where that is asked
+_PARALLEL = 0.95  # cosine of the angle between two sides that determine one direction
+_SURE = 0.95  # a mode with less of the belief's weight is one of several
 
 
 class MetrologyParameters(NamedTuple):
@@ -112,18 +119,26 @@ def three_two_one(
         parameters: of the plan.
 
     Raises:
-        InputError: the part's top has no room for the peg, or a parameter is out of range.
+        InputError: the part's top has no room for the peg, its sides are under an overhang or all parallel,
+            the belief has the part upside down, or a parameter is out of range.
+
+    Warns:
+        RuntimeWarning: the belief has several modes, or is wider than the longest stroke.
     """
     chosen = _checked(MetrologyParameters() if parameters is None else parameters)
+    _refuse_upside_down(belief)
+    _warn_of_modes(belief)
     top = top_of(part)
-    height = top - min(chosen.side_depth, 0.5 * float(part.extent[2]))
-    radius = float(np.linalg.norm(peg.vertices[:, :2], axis=1).max())
+    height = _side_height(part, top, chosen)
+    unsure = half_stroke(belief, np.array([0.0, 0.0, top]), UP, chosen)
+    foot = shapely.get_coordinates(lowest_outline(peg, top - height + unsure))
+    radius = float(np.linalg.norm(foot, axis=1).max())
     lateral = max(half_stroke(belief, np.array([0.0, 0.0, top]), axis, chosen) for axis in np.eye(3)[:2])
     points = points_on_top(part, peg, lateral)
     last = points.positions[2]
     first, second = _two_sides(sides(part, height), last, radius)
-    one = _SideTouch.of(belief, first, peg, height, chosen)
-    other = _SideTouch.of(belief, second, peg, height, chosen)
+    one = _SideTouch.of(belief, first, foot, height, chosen)
+    other = _SideTouch.of(belief, second, foot, height, chosen)
     begin, end = one.slide(last, other.middle)
     here, there = other.slide(end, end)
     above = top + half_stroke(belief, np.array([*begin, top]), UP, chosen)
@@ -160,10 +175,10 @@ class _SideTouch(NamedTuple):
 
     @classmethod
     def of(
-        cls, belief: Belief, face: Side, peg: Part, height: float, parameters: MetrologyParameters
+        cls, belief: Belief, face: Side, foot: Array, height: float, parameters: MetrologyParameters
     ) -> _SideTouch:
         normal = np.array([*face.normal, 0.0])
-        reach = float((peg.vertices[:, :2] @ -face.normal).max())  # of the peg towards the face
+        reach = float((foot @ -face.normal).max())  # of the peg towards the face
         ends = np.array([[*face.start, height], [*face.stop, height]])
         tangent = np.array([-normal[1], normal[0], 0.0])
         inset = min(face.length / 3.0, half_stroke(belief, ends, tangent, parameters))
@@ -219,6 +234,41 @@ class _SideTouch(NamedTuple):
         return self.parameters.touch(here + self.clear, here + self.stop, here + self.stop - self.press)
 
 
+def _refuse_upside_down(belief: Belief) -> None:
+    if not float(poses.rotation_matrix(belief.mean)[2, 2]) > 0.0:
+        raise InputError(
+            "the part's top faces down at the belief's mean, so that a peg would come from below; check the "
+            "guess, or turn the part's mesh until its z axis points out of its top."
+        )
+
+
+def _warn_of_modes(belief: Belief) -> None:
+    modes = belief.modes()
+    if modes[0].mass < _SURE:
+        warnings.warn(
+            f"the belief has several modes, the heaviest with {100.0 * modes[0].mass:.0f} % of its weight, "
+            "and touches are planned for their mean; look once more, or plan for one "
+            "(belief.modes()[0].belief).",
+            RuntimeWarning,
+            stacklevel=3,
+        )
+
+
+def _side_height(part: Part, top: float, parameters: MetrologyParameters) -> float:
+    """The height z at which sides are touched: as deep as nothing above stands out farther."""
+    deepest = min(parameters.side_depth, 0.5 * float(part.extent[2]))
+    for share in _DEPTHS:
+        height = top - share * deepest
+        outline = shapely.Polygon(section(part, height).exterior).buffer(_OVERHANG)
+        above = (section(part, z) for z in np.linspace(height, top - _OVERHANG, _SECTIONS))
+        if all(outline.covers(each) for each in above):
+            return height
+    raise InputError(
+        f"the sides of part {part.name!r} are under an overhang, which the peg would meet first; plan "
+        "touches by hand (bcppl.inference.planning.touch)."
+    )
+
+
 def _around(
     outline: shapely.Polygon,
     start: Array,
@@ -247,7 +297,14 @@ def _two_sides(faces: list[Side], near: Array, radius: float) -> tuple[Side, Sid
 
     first = min(longest, key=away)
     across = [face for face in faces if abs(float(face.normal @ first.normal)) < 0.5]
-    second = min(across or faces, key=lambda face: (-round(face.length, 3), away(face)))
+    if across:
+        return first, min(across, key=lambda face: (-round(face.length, 3), away(face)))
+    second = min(faces, key=lambda face: abs(float(face.normal @ first.normal)))
+    if abs(float(second.normal @ first.normal)) > _PARALLEL:
+        raise InputError(
+            "the part's sides are all parallel, so that touches of two leave it free to move along them; "
+            "plan touches by hand (bcppl.inference.planning.touch)."
+        )
     return first, second
 
 

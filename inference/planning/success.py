@@ -21,7 +21,7 @@ from bcppl.inference.planning.waypoints import tip_of
 from bcppl.inference.resampling import seeded, systematic
 from bcppl.robot.plan import InsertionPlan, Plan, probe_of
 
-_BESIDE = 0.002  # m: a tip farther from the hole's axis is not in the hole
+_BESIDE, _SHARE = 0.002, 0.25  # m, and of the hole's width: a tip farther from its axis is not in the hole
 _AT_ONCE = 50  # stamps that are simulated before particles whose search has ended are left out
 
 
@@ -122,12 +122,20 @@ def _search(
         rows, stamps = np.flatnonzero(ended), sunk[ended].argmax(axis=1)
         ends[left[ended]] = world_from_peg[rows, stamps]
         # A peg also sinks beside the part, or in another pocket of it, which ends the search too.
-        hole_found[left[ended]] = lateral_error(hole, physics.peg, part_from_peg[rows, stamps]) < _BESIDE
+        hole_found[left[ended]] = lateral_error(hole, physics.peg, part_from_peg[rows, stamps]) < _beside(
+            hole
+        )
         if ended.all():
             break
         left, rollout = left[~ended], rollout[~ended]
         ends[left] = rollout.world_from_peg[:, -1]
     return hole_found, ends
+
+
+def _beside(hole: Hole) -> float:
+    """The distance (m) of a tip from a hole's axis from which on it is not in it."""
+    left, front, right, back = hole.outline.bounds
+    return min(_BESIDE, _SHARE * min(right - left, back - front))
 
 
 def _push(
@@ -149,7 +157,7 @@ def _push(
     world_from_peg = torch.from_numpy(rollout.world_from_peg[np.arange(len(pegs)), stamps])
     part_from_peg = poses.compose(poses.inverse(moved), world_from_peg).numpy()
     deep = depth_reached(hole, physics.peg, part_from_peg) >= plan.deep_enough
-    return np.asarray(deep & (lateral_error(hole, physics.peg, part_from_peg) < _BESIDE))
+    return np.asarray(deep & (lateral_error(hole, physics.peg, part_from_peg) < _beside(hole)))
 
 
 def _stopped(rollout: Rollout, force: float) -> npt.NDArray[np.int64]:

@@ -162,9 +162,11 @@ def slide(
     The other arguments are those of `touch`.
 
     Raises:
-        InputError: a parameter is out of range.
+        InputError: a parameter is out of range, the normal is not of unit length, the displacement leaves the
+            surface, or the peg leans towards a side.
     """
     chosen = _checked(parameters)
+    displacement = _refuse_off_surface(point, displacement)
     stroke = _Stroke.of(belief, part, _turned(peg, lean, point), point, chosen)
     sliding: list[Waypoint] = []
     if np.linalg.norm(displacement) > 0.0:
@@ -269,6 +271,21 @@ def _checked(parameters: TouchParameters | None) -> TouchParameters:
             most = _LARGEST.get(name, math.inf)
             number_within(f"a touch has {name} {{}}", value, above=0.0, most=most)
     return checked
+
+
+def _refuse_off_surface(point: SurfacePoint, displacement: Array) -> Array:
+    """The displacement (3,) of a slide that begins at a point, which is along the surface there."""
+    normal, along = (np.asarray(each, dtype=np.float64) for each in (point.normal, displacement))
+    if not abs(float(np.linalg.norm(normal)) - 1.0) < 1e-3:
+        raise InputError(
+            f"the normal of a touch is {normal.tolist()}; give a unit vector out of the surface."
+        )
+    if not (np.isfinite(along).all() and abs(float(along @ normal)) <= 0.05 * np.linalg.norm(along)):
+        raise InputError(
+            f"a slide by {along.tolist()} m leaves the surface, whose normal is {normal.round(3).tolist()}; "
+            "give a displacement across that."
+        )
+    return along
 
 
 def _contact(

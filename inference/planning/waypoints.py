@@ -25,6 +25,7 @@ STIFFNESS = (2500.0, 2500.0, 2500.0, 150.0, 150.0, 150.0)
 DAMPING = (120.0, 120.0, 120.0, 2.5, 2.5, 2.5)
 UP = np.array([0.0, 0.0, 1.0])
 NO_LEAN = np.zeros(3)
+_LEFT_OUT = 0.05  # of the belief's weight, beyond the longest half stroke, of which nobody is warned
 
 
 class Waypoint(NamedTuple):
@@ -50,6 +51,9 @@ def half_stroke(
 
     The position (3,) on the surface, or several (K, 3), of which the most uncertain counts, and the normal
     (3,) there are in the part's frame.
+
+    Warns:
+        RuntimeWarning: the surface may well be farther away than the longest half stroke.
     """
     of_particles = poses.transform(belief.world_from_part, torch.as_tensor(np.atleast_2d(positions)))
     direction = poses.rotation_matrix(belief.mean) @ torch.as_tensor(normal)
@@ -57,6 +61,13 @@ def half_stroke(
     mean = belief.weights @ along
     deviation = float(torch.sqrt(belief.weights @ (along - mean) ** 2).max())
     shortest, longest = limits.shortest_half_stroke, limits.longest_half_stroke
+    if float((belief.weights @ ((along - mean).abs() > longest).to(belief.weights)).max()) > _LEFT_OUT:
+        warnings.warn(
+            f"a surface may be farther away than half a stroke is long ({1e3 * longest:g} mm), so that the "
+            "peg may meet it at speed; look once more, or give a longer longest_half_stroke.",
+            RuntimeWarning,
+            stacklevel=2,
+        )
     return float(np.clip(limits.standard_deviations * deviation, shortest, longest))
 
 

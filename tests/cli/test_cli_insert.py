@@ -99,12 +99,12 @@ def test_candidates_that_search_are_for_the_hole_that_is_chosen() -> None:
     belief = Belief(world_from_part, torch.zeros(200, dtype=torch.float64))
     recording = replace(load_recording("peg_probe"), part=plate, peg=PEG, measurements=[])
     for x in (-0.015, 0.015):
-        searches = candidates.planned({"search": 2}, belief, recording, [], None, (x, 0.001), 0)
+        searches = candidates.planned({"search": 2}, belief, recording, [], None, 0, (x, 0.001))
         for each in searches:
             middle = each.world_from_peg[each.manners.index("searching"), 0]
             assert middle == pytest.approx(0.5 + x, abs=1e-3)
     with pytest.raises(InputError, match="2 holes in its top"):
-        candidates.planned({"search": 2}, belief, recording, [], None, None, 0)
+        candidates.planned({"search": 2}, belief, recording, [], None, 0)
 
 
 @pytest.mark.long

@@ -16,7 +16,7 @@ from bcppl.contact.mujoco_model import ContactParameters
 from bcppl.contact.physics import PegPhysics
 from bcppl.contact.quasi_static import QuasiStaticMotion, WindowMotion
 from bcppl.distributions.manifold import ContactManifold
-from bcppl.geometry.extrusion import block, block_with_hole, box_peg, peg_for
+from bcppl.geometry.extrusion import block, block_with_hole, block_with_square_hole, box_peg, peg_for
 from bcppl.geometry.gap import PegGap
 from bcppl.geometry.outlines import round_outline
 from bcppl.models.worlds.bench.scene import BenchScene, bench_scene
@@ -319,6 +319,17 @@ def test_stamps_far_apart_lead_through_no_wall() -> None:
         assert float(on_a_block().gap(poses.identity(1), peg[:, :7]).distance.min()) > -2e-7
         assert peg[-1, 7] == 1.0
         assert float(peg[-1, 2]) > LENGTH - 2e-7 if not end[0] else float(peg[-1, 0]) < -0.03
+
+
+@pytest.mark.parametrize("depth", [0.0003, 0.0009, 0.005])
+def test_from_a_shallow_hole_a_peg_does_not_jump(depth: float) -> None:
+    """Its play is half a millimetre: leaning on one wall it is led against the next one."""
+    solid = QuasiStaticMotion(
+        PegGap(block_with_square_hole((0.06, 0.06, 0.025), 0.0165), box_peg(0.016, LENGTH))
+    )
+    command = way((0, 0, -depth), (0.004, 0, -depth), (0.004, 0.004, -depth), count=100)
+    expected = torch.tensor([0.00025, 0.00025, LENGTH - depth], dtype=torch.float64)
+    torch.testing.assert_close(solid(poses.identity(1), command)[0, -1, :3], expected, atol=2e-6, rtol=0.0)
 
 
 def test_a_peg_that_turned_far_away_stops_as_it_is_turned_then() -> None:

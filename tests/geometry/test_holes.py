@@ -67,6 +67,51 @@ def test_a_counterbore_is_a_hole_for_a_wide_peg_and_a_chamfer_for_a_narrow_one()
         fit_in(hole_of(part, peg=pin(0.014)), pin(0.014))
 
 
+def bored(*tools: trimesh.Trimesh) -> Part:
+    """A block, 30 mm high, without some solids."""
+    box = trimesh.creation.box((0.08, 0.06, 0.03))
+    box.apply_translation((0.0, 0.0, -0.015))
+    mesh = trimesh.boolean.difference([box, *tools])
+    part = Part("bored block", np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    part.check()
+    return part
+
+
+def straight(x: float, diameter: float, depth: float, angle: float = 0.0) -> trimesh.Trimesh:
+    """A drill of a diameter and a depth below the top, at an angle (rad) to the part's z axis."""
+    tool = trimesh.creation.cylinder(0.5 * diameter, 2.0 * depth, sections=SIDES)
+    tool.apply_transform(trimesh.transformations.rotation_matrix(angle, [0.0, 1.0, 0.0]))
+    tool.apply_translation((x, 0.0, 0.0))
+    return tool
+
+
+def test_of_holes_in_the_floor_of_a_wider_one_the_point_chooses_as_deep_as_it_goes() -> None:
+    part = bored(straight(0.0, 0.05, 0.006), straight(-0.015, 0.01, 0.04), straight(0.015, 0.01, 0.04))
+    for x in (-0.015, 0.015):
+        hole = hole_of(part, (x, 0.001), pin(0.010))
+        assert hole.part_from_hole[0] == pytest.approx(x, abs=1e-5) and hole.through
+    with pytest.raises(InputError, match="2 holes below its top that take the peg"):
+        hole_of(part, peg=pin(0.010))
+    assert hole_of(part, (0.0, 0.0), pin(0.010)).depth == pytest.approx(0.006)
+    assert hole_of(part, peg=pin(0.05)).depth == pytest.approx(0.006)
+
+
+def test_a_hole_beside_the_middle_of_its_counterbore_is_the_one_that_takes_the_peg() -> None:
+    part = bored(straight(0.0, 0.03, 0.006), straight(0.009, 0.008, 0.04))
+    hole = hole_of(part, peg=pin(0.008))
+    assert hole.part_from_hole[0] == pytest.approx(0.009, abs=1e-5)
+    assert hole.through and hole.chamfer == pytest.approx(0.006)
+
+
+def test_of_walls_that_lean_what_is_left_straight_down_counts() -> None:
+    narrowing = turned("cone", (0.0, -0.0301), (0.004, -0.0301), (0.005, 1e-5), (0.0, 1e-5)).mesh
+    for tool in (narrowing, straight(0.0, 0.01, 0.06, math.radians(10.0))):
+        part = bored(tool)
+        with pytest.raises(InputError, match="does not fit the hole"):
+            fit_in(hole_of(part, peg=pin(0.0095)), pin(0.0095))
+    assert fit_in(hole_of(bored(narrowing), peg=pin(0.0079)), pin(0.0079)).clearance > 0.0
+
+
 @pytest.mark.parametrize("length", [0.003, 0.015])
 def test_a_peg_with_a_cone_is_as_wide_as_what_goes_in(length: float) -> None:
     part = block_with_hole(round_outline(2.0 * RADIUS), (0.06, 0.06, 0.025))

@@ -121,7 +121,7 @@ def probe(
     now = posterior(recording, of, model, given, inference, particles, seed, console, refuse)
     belief = now.population.belief(now.model.pose)
     require_uncertain(belief)
-    listed = options.planned(asked, belief, now.recording, constraints, table, point, seed)
+    listed = options.planned(asked, belief, now.recording, constraints, table, seed, point)
     console.print(escape(visible(str(listed))), soft_wrap=True)
     scene = now.model.prepare(with_candidates(now.recording, listed))
     linearised = can_be_linearised(scene, listed)

@@ -25,7 +25,7 @@ SHARE = Range(least=0.0, below=1.0)
 TAIL, FARTHEST = 0.01, 3.0
 
 
-class _BoxPose(PoseDistribution):
+class BoxPose(PoseDistribution):
     """Uniform in a box, times Haar measure restricted to a set of rotations of a normalised `measure`.
 
     With a `tail`, that share of each coordinate's mass is spread evenly from there to `FARTHEST` half widths,
@@ -84,7 +84,7 @@ class _BoxPose(PoseDistribution):
         return poses.from_translation_quaternion_xyzw(center[..., :3] + translation, quaternion)
 
 
-class UniformPose(_BoxPose):
+class UniformPose(BoxPose):
     """Uniform in a box times uniform (Haar) within an angle of a given orientation.
 
     Args:
@@ -148,7 +148,7 @@ def _beyond_sine(angle: Array) -> Array:
     return np.where(angle < 0.01, series, angle - np.sin(angle))
 
 
-class SwingTwistPose(_BoxPose):
+class SwingTwistPose(BoxPose):
     """Uniform in a box times uniform (Haar) over rotations with limited tilt and limited yaw.
 
     A rotation away from the centre is split into a swing of the part's z axis and a twist about it,
