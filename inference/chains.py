@@ -96,7 +96,7 @@ def markov_chains(
     """
     refuse_no_kernel("markov_chains", kernel)
     moves = whole_number("chains are to make {} moves", moves)
-    every = whole_number("chains are to be recorded every {} moves", every)
+    every = whole_number("chains are to be recorded every {} moves", every, most=moves)
     warm_up = whole_number("chains are to warm up for {} moves", warm_up, least=0)
     if isinstance(start, Trace):
         start = Population(start)

@@ -84,10 +84,16 @@ def with_settings(model: Model, settings: Mapping[str, Any], name: str) -> Model
     try:
         inspect.signature(model.prepare).bind(None, **settings)
     except TypeError as error:
-        raise InputError(
-            f"model {name} takes no setting {next(iter(settings))!r}: its `prepare` is called with the "
-            "recording alone; leave --set out, or let it take settings."
-        ) from error
+        known = [
+            n for n, p in inspect.signature(model.prepare).parameters.items() if p.default is not p.empty
+        ]
+        wrong = next((each for each in settings if each not in known), next(iter(settings)))
+        offered = (
+            f"it has {', '.join(known)}."
+            if known
+            else "its `prepare` is called with the recording alone; leave --set out, or let it take settings."
+        )
+        raise InputError(f"model {name} takes no setting {wrong!r}: {offered}") from error
     return model.with_settings(**settings)
 
 

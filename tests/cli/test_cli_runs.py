@@ -296,4 +296,11 @@ def test_a_model_without_settings_is_given_none(bcppl: Callable[..., Ran], tmp_p
     words = ("run", "short.h5", "--particles", 20, "--model", "plain.py", "--out", "out")
     assert bcppl(*words).code == 0
     ran = bcppl(*words, "--set", "offset=0.01")
-    assert ran.code == 2 and "model plain.py takes no setting 'offset'" in ran.err
+    assert (
+        ran.code == 2 and "model plain.py takes no setting 'offset': its `prepare` is called with" in ran.err
+    )
+    (tmp_path / "own.py").write_text(
+        (tmp_path / "plain.py").read_text().replace("(recording):", "(recording, spread=1):")
+    )
+    ran = bcppl(*words, "--model", "own.py", "--set", "spred=0.01")
+    assert ran.code == 2 and "model own.py takes no setting 'spred': it has spread." in ran.err
