@@ -321,6 +321,8 @@ def infer(
     def gaussian(scene: Any) -> GaussianApproximation:
         return GaussianApproximation(model.pose, to_device(scene, HOST))
 
+    if scene is not None:
+        gaussian(scene)  # refuses a prior that it cannot approximate before anything is computed
     moves = kernel(model.pose, gaussian_proposals, screen=screen)
 
     def refitted(trace: Trace, near: Tensor) -> GaussianApproximation:
