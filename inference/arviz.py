@@ -18,7 +18,8 @@ from bcppl.errors import InputError
 from bcppl.inference.chains import Chains
 from bcppl.inference.population import Population
 from bcppl.inference.resampling import seeded, systematic
-from bcppl.inference.summaries import is_pose
+from bcppl.inference.summaries import is_angle, is_pose
+from bcppl.poses.quaternions import wrapped_angle
 
 POSE_COORDINATES = ("x", "y", "z", "qw", "qx", "qy", "qz")
 
@@ -43,7 +44,7 @@ def to_arviz(runs: Any, *, draws: int | None = None, seed: int = 0) -> Any:
 
         - posterior: every latent address, (chain, draw, *event). A pose has its seven numbers along the
           dimension `pose` (x y z in metres, qw qx qy qz), with the sign of each quaternion that is nearer to
-          the mean's.
+          the mean's. An angle is within half a turn of the mean, which is circular.
         - log_likelihood: of every observed address, (chain, draw).
         - sample_stats: (chain, draw) `lp`, the log-probability of all sites; `log_weight`, unnormalised, of
           the drawn particle; `particle`, its index; `founder`, the index of its ancestor in the first
@@ -117,10 +118,15 @@ def population_of(given: Any, asked: str) -> Population:
 
 
 def _inference_data(arviz: Any, population: Population, posterior: dict[str, Tensor], **groups: Any) -> Any:
-    """Draws by address, the quaternions of poses with one sign, the observations, and other groups."""
+    """Draws by address, quaternions with one sign, angles of one turn, the observations, and other groups."""
     posed = [address for address in posterior if is_pose(population, address)]
+    for address, values in posterior.items():
+        if address in posed:
+            posterior[address] = _one_sign(values)
+        elif is_angle(population, address):
+            posterior[address] = _one_turn(values)
     return arviz.from_dict(
-        posterior=_numpy({a: _one_sign(v) if a in posed else v for a, v in posterior.items()}),
+        posterior=_numpy(posterior),
         observed_data=_numpy(population.trace.observations) or None,
         coords={"pose": list(POSE_COORDINATES)} if posed else None,
         dims={address: ["pose"] for address in posed},
@@ -194,6 +200,12 @@ def _one_sign(world_from_part: Tensor) -> Tensor:
     mean = mean if float(mean[0]) >= 0 else -mean
     sign = torch.where(pooled[:, 3:] @ mean < 0, -1.0, 1.0)[:, None]
     return torch.cat([pooled[:, :3], sign * pooled[:, 3:]], dim=1).reshape(world_from_part.shape)
+
+
+def _one_turn(angles: Tensor) -> Tensor:
+    """Angles (chain, draw, *event) within half a turn of their mean, where ArviZ's own means are right."""
+    middle = torch.atan2(angles.sin().mean(dim=(0, 1)), angles.cos().mean(dim=(0, 1)))
+    return middle + wrapped_angle(angles - middle)
 
 
 def _numpy(values: Mapping[str, Tensor]) -> dict[str, np.ndarray]:

@@ -26,7 +26,7 @@ from bcppl.inference.kernels import cycle, metropolis_hastings
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import drift
 from bcppl.inference.repetitions import Repeated
-from bcppl.traces import generate
+from bcppl.traces import generate, simulate
 
 arviz = export.import_arviz()
 TURNED = poses.as_pose([0.1, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0])
@@ -205,3 +205,14 @@ def test_without_arviz_one_sentence_says_how_to_get_it(monkeypatch: pytest.Monke
     monkeypatch.setitem(sys.modules, "arviz", None)
     with pytest.raises(InputError, match=r"ArviZ is not installed; run `pip install 'bcppl\[arviz\]'`"):
         to_arviz(weighted(5, 1))
+
+
+def test_angles_about_half_a_turn_are_not_torn_apart() -> None:
+    def heading() -> None:
+        pyro.sample("a", dist.VonMises(number(math.pi)[0], 20.0))
+
+    population = Population(simulate(heading, (), 500))
+    for runs in (population, [population, population]):
+        angles = to_arviz(runs).posterior["a"].values
+        assert angles.std() == pytest.approx(20.0**-0.5, rel=0.15)
+        assert math.cos(angles.mean() - math.pi) > 0.99
