@@ -117,7 +117,8 @@ def spread_over_time(axes: Axes, labels: Sequence[str], spread: Array, relative:
     if relative is not None and np.isfinite(relative).any():
         axes.plot(at, relative, color=SEEN, marker="s", markersize=4, label="as seen from the held peg")
         axes.legend(frameon=False, fontsize=8)
-    axes.set_yscale("log")
+    if (np.asarray(spread) > 0.0).any():  # of a guess that is a point there is none
+        axes.set_yscale("log")
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.yaxis.set_minor_formatter(NullFormatter())
     axes.set_ylabel("spread (mm)")
