@@ -23,7 +23,8 @@ from bcppl.distributions.support import Support, base, freedom_of
 from bcppl.traces import Program, Trace, simulate
 from bcppl.traces.values import Values
 
-_MOST = 1000  # draws: what is accepted less often than that is taken for as probable
+# Draws at a time, as long as none is accepted; what is accepted less often is taken for as probable.
+_ROUNDS = (1, 4, 16, 64)
 
 Share = Callable[[Tensor], Tensor]
 
@@ -49,18 +50,20 @@ def log_conditioned(
     total = torch.zeros(count, dtype=torch.float64)
     if not shares:
         return total
-    left, trials = torch.arange(count), torch.ones(count, dtype=torch.float64)
-    for _ in range(_MOST):
-        there = new if len(left) == count else new.chosen(left)
-        drawn = read(simulate(backward, (there,), len(left)), {a: there[a] for a in latent})
-        accepted = torch.ones(len(left), dtype=torch.float64)
+    left, trials = torch.arange(count), torch.zeros(count, dtype=torch.float64)
+    for draws in _ROUNDS:
+        there = new if draws == 1 else new.chosen(left.repeat_interleave(draws))
+        drawn = read(simulate(backward, (there,), len(there)), {a: there[a] for a in latent})
+        accepted = torch.ones(len(there), dtype=torch.float64)
         for address, share in shares.items():
             if address in drawn:
                 accepted = accepted * share(drawn[address])
-        left = left[torch.rand(len(left), dtype=torch.float64) >= accepted]
+        kept = (torch.rand(len(there), dtype=torch.float64) < accepted).reshape(len(left), draws)
+        found = kept.any(dim=1)
+        trials[left] += torch.where(found, kept.to(torch.float64).argmax(dim=1) + 1.0, float(draws))
+        left = left[~found]
         if not len(left):
             break
-        trials[left] += 1.0
     for address, share in shares.items():
         total = total + share(latent[address]).log()
     return total + trials.log()

@@ -71,6 +71,7 @@ SEVERAL = 1800
 # Of an approximation, where a prior's limits do not matter: a box is no Gaussian, and particles in its
 # corners had too little weight, for any number of them. Where less lies inside, the measurement is tempered.
 INSIDE = 0.9
+ALL = 0.99  # the same, from which on nothing is made of the limits
 # Sweeps are made until the poses are displaced by so many variances, and no more than so many: one displaces
 # them by .2 to 1 where touches tell them, and by less along a bent ridge such as a peg wedged in a hole
 # leaves. There particles died out along it from window to window, and what was left was sure of a part.
@@ -83,7 +84,7 @@ DISTINCT = 0.75
 def gaussian_pair(before: Any, after: Any, action: Any) -> Pair:
     """Forward and backward kernels of one measurement, of Gaussian approximations without and with it."""
     forward, backward = forward_kernel(before, after, action), backward_kernel(before, after, action)
-    return Pair(forward, backward, inside=before.share_inside(action) == 1.0)
+    return Pair(forward, backward, inside=before.share_inside(action) > ALL)
 
 
 def gaussian_proposals(approximation: Any) -> Sequence[Program]:
