@@ -76,6 +76,8 @@ def plan_candidates(
     asked = MIXED if kinds is None else kinds
     if not isinstance(asked, Mapping):
         raise InputError(f"kinds of candidates are {asked!r}; give a number of each: {{'touch': 8}}.")
+    if isinstance(constraints, Constraint) or not isinstance(constraints, Sequence):
+        raise InputError("constraints are given that are no list; give a list of them: [force_at_most(5.0)].")
     known = candidate_kinds()
     if peg is not None:
         peg.check(closed=False)

@@ -166,6 +166,8 @@ def slide(
             surface, or the peg leans towards a side.
     """
     chosen = _checked(parameters)
+    point = SurfacePoint(*(np.asarray(each, dtype=np.float64) for each in point))
+    lean = np.asarray(lean, dtype=np.float64)
     displacement = _refuse_off_surface(point, displacement)
     stroke = _Stroke.of(belief, part, _turned(peg, lean, point), point, chosen)
     sliding: list[Waypoint] = []
@@ -275,7 +277,7 @@ def _checked(parameters: TouchParameters | None) -> TouchParameters:
 
 def _refuse_off_surface(point: SurfacePoint, displacement: Array) -> Array:
     """The displacement (3,) of a slide that begins at a point, which is along the surface there."""
-    normal, along = (np.asarray(each, dtype=np.float64) for each in (point.normal, displacement))
+    normal, along = point.normal, np.asarray(displacement, dtype=np.float64)
     if not abs(float(np.linalg.norm(normal)) - 1.0) < 1e-3:
         raise InputError(
             f"the normal of a touch is {normal.tolist()}; give a unit vector out of the surface."

@@ -19,10 +19,11 @@ from bcppl.errors import InputError
 from bcppl.geometry.extrusion import block, block_with_square_hole, box_peg, extruded, round_peg
 from bcppl.geometry.gap import PegGap
 from bcppl.geometry.parts import Part, Piece
+from bcppl.inference.planning.candidate_layout import plan_candidates
 from bcppl.inference.planning.constraints import feasible, require_candidates
 from bcppl.inference.planning.faces import boundary_points, points_on_top, section, sides
 from bcppl.inference.planning.metrology import ROCKED, MetrologyParameters, three_two_one
-from bcppl.inference.planning.motion_constraints import collision_free
+from bcppl.inference.planning.motion_constraints import collision_free, force_at_most
 from bcppl.inference.planning.motions import expected_contacts
 from bcppl.inference.planning.touching import SurfacePoint, slide, touch
 from bcppl.models.parts import insert_peg, insert_tray
@@ -353,6 +354,10 @@ def test_what_three_two_one_cannot_keep_is_stated() -> None:
 
 def test_a_slide_stays_on_the_surface_and_a_normal_is_of_unit_length() -> None:
     part, peg = block((0.06, 0.06, 0.025)), box_peg(0.01, 0.08)
+    listed = slide(near(), part, peg, ((0, 0, 0), (0, 0, 1)), [0.01, 0, 0], lean=[0.0, 0.0, 0.1])  # type: ignore
+    assert np.isfinite(listed.world_from_peg).all()
+    with pytest.raises(InputError, match="give a list of them"):
+        plan_candidates(near(), part, peg, constraints=force_at_most(5.0))  # type: ignore[arg-type]
     for normal, displacement, words in (
         ([0.0, 0.0, 1.0], [0.01, 0.0, -0.05], "leaves the surface"),
         ([0.0, 0.0, 1.0], [NAN, 0.0, 0.0], "leaves the surface"),
