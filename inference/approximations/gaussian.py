@@ -247,14 +247,14 @@ class GaussianApproximation:
 
     @on_host()
     def share_inside(self, action: Any) -> float:
-        """How much of it lies where the prior's limits do not matter, before a measurement."""
+        """How much of it lies where the prior is as dense as anywhere in it, before a measurement."""
         if self.adapted is None and isinstance(self.scene.sensor(action), FitsPose):
             return 1.0  # its conditional has the same limits
         centers, covariances, log_weights = self.mixture
         drawn = poses.exp(centers[:, None], _DRAWS @ torch.linalg.cholesky(covariances).transpose(-1, -2))
-        prior = self.scene.prior
-        inside = prior.log_prob(drawn) >= prior.log_prob(prior.center)
-        return float(log_weights.softmax(dim=0) @ inside.to(torch.float64).mean(dim=1))
+        density = self.scene.prior.log_prob(drawn)
+        relative = (density - density.max()).exp()
+        return float(log_weights.softmax(dim=0) @ relative.mean(dim=1))
 
     def screens(self, action: Any) -> bool:
         """Whether a measurement is simulated, and what is approximated is a cheap likelihood of it."""

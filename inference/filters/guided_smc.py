@@ -70,7 +70,7 @@ ASKED = 4  # particles that are evaluated first for that
 SEVERAL = 1800
 # Of an approximation, where a prior's limits do not matter: a box is no Gaussian, and particles in its
 # corners had too little weight, for any number of them. Where less lies inside, the measurement is tempered.
-INSIDE = 0.9
+INSIDE = 0.75
 ALL = 0.99  # the same, from which on nothing is made of the limits
 # Sweeps are made until the poses are displaced by so many variances, and no more than so many: one displaces
 # them by .2 to 1 where touches tell them, and by less along a bent ridge such as a peg wedged in a hole
