@@ -83,11 +83,10 @@ def hole_of(part: Part, inside: tuple[float, float] | None = None, peg: Part | N
             "`inside`."
         )
     middle = _middle(first[0]) if inside is None else shapely.Point(inside)
-    rings: list[shapely.Polygon] = []
 
-    def down_to(count: int) -> Hole:
-        """The hole down to the lower end of a number of sections."""
-        least = min(ring.area + _WIDER * ring.length for ring in rings[:count])
+    def along(rings: list[shapely.Polygon]) -> Hole:
+        """The hole of a ring in each of the first sections, down to the lower end of the last."""
+        least, count = min(ring.area + _WIDER * ring.length for ring in rings), len(rings)
         narrowest = next(k for k, ring in enumerate(rings) if ring.area <= least)
         ring, top = _room(part, rings[narrowest], layers[narrowest:count]), levels[0]
         centre = np.array([ring.centroid.x, ring.centroid.y, top])
@@ -99,14 +98,13 @@ def hole_of(part: Part, inside: tuple[float, float] | None = None, peg: Part | N
             count == len(sections),
         )
 
+    rings: list[shapely.Polygon] = []
     for section in sections:
         around = [ring for ring in section if ring.contains(middle)]
         if not around and rings and peg is not None and inside is None:
             # In the floor of a counterbore, beside its middle.
-            for ring in [ring for ring in section if rings[-1].contains(ring.representative_point())]:
-                rings.append(ring)
-                around += [ring] if _takes(down_to(len(rings)), peg) else []
-                rings.pop()
+            below = [ring for ring in section if rings[-1].contains(ring.representative_point())]
+            around = [ring for ring in below if _takes(along([*rings, ring]), peg)]
             if len(around) > 1:
                 raise InputError(
                     f"part {part.name!r} has {len(around)} holes below its top that take the peg, at "
@@ -117,8 +115,8 @@ def hole_of(part: Part, inside: tuple[float, float] | None = None, peg: Part | N
             break
         rings.append(around[0])
     counts = range(1, len(rings) + 1)
-    taking = 0 if peg is None else bisect_left(counts, True, key=lambda n: not _takes(down_to(n), peg))
-    return down_to(taking or len(rings))
+    taking = 0 if peg is None else bisect_left(counts, True, key=lambda n: not _takes(along(rings[:n]), peg))
+    return along(rings[: taking or len(rings)])
 
 
 class Fit(NamedTuple):

@@ -224,8 +224,8 @@ class Filter:
     def insertion(
         self,
         parameters: InsertionParameters | None = None,
-        hole: Hole | None = None,
         timeout: float | None = None,
+        hole: Hole | None = None,
     ) -> InsertionPlan:
         """A compliant insertion at the newest belief (`bcppl.inference.planning.insertion`).
 

@@ -166,7 +166,7 @@ def slide(
             surface, or the peg leans towards a side.
     """
     chosen = _checked(parameters)
-    point = SurfacePoint(*(np.asarray(each, dtype=np.float64) for each in point))
+    point = _checked_point(point)
     lean = np.asarray(lean, dtype=np.float64)
     displacement = _refuse_off_surface(point, displacement)
     stroke = _Stroke.of(belief, part, _turned(peg, lean, point), point, chosen)
@@ -198,7 +198,8 @@ def pair(
     """
     chosen = _checked(parameters)
     chosen = chosen._replace(dwell=_SHORTER * chosen.dwell)
-    one, other = (_Stroke.of(belief, part, peg, point, chosen) for point in (first, second))
+    points = _checked_point(first), _checked_point(second)
+    one, other = (_Stroke.of(belief, part, peg, point, chosen) for point in points)
     over = min(one.above[2], other.above[2]) - chosen.safe_height + _OVER
     between = [
         one.clear,
@@ -275,13 +276,18 @@ def _checked(parameters: TouchParameters | None) -> TouchParameters:
     return checked
 
 
-def _refuse_off_surface(point: SurfacePoint, displacement: Array) -> Array:
-    """The displacement (3,) of a slide that begins at a point, which is along the surface there."""
-    normal, along = point.normal, np.asarray(displacement, dtype=np.float64)
+def _checked_point(point: SurfacePoint) -> SurfacePoint:
+    position, normal = (np.asarray(each, dtype=np.float64) for each in point)
     if not abs(float(np.linalg.norm(normal)) - 1.0) < 1e-3:
         raise InputError(
             f"the normal of a touch is {normal.tolist()}; give a unit vector out of the surface."
         )
+    return SurfacePoint(position, normal)
+
+
+def _refuse_off_surface(point: SurfacePoint, displacement: Array) -> Array:
+    """The displacement (3,) of a slide that begins at a point, which is along the surface there."""
+    normal, along = point.normal, np.asarray(displacement, dtype=np.float64)
     if not (np.isfinite(along).all() and abs(float(along @ normal)) <= 0.05 * np.linalg.norm(along)):
         raise InputError(
             f"a slide by {along.tolist()} m leaves the surface, whose normal is {normal.round(3).tolist()}; "

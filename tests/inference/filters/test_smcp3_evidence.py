@@ -208,7 +208,7 @@ def nudged(trace: Trace) -> None:
 
 @pytest.mark.parametrize("inside", [False, True])
 def test_what_a_backward_program_chooses_beyond_a_prior_is_not_lost(inside: bool) -> None:
-    """Unless it is stated that it chooses nothing there: .49 nats a measurement, for any number of them."""
+    """Unless it is stated that it chooses nothing there."""
     torch.manual_seed(2)
     population = importance_sampling(limited, (0,), {}, 40_000)
     step = smcp3.smcp3(Pair(nudged, nudged, inside=inside), resample=never)
@@ -224,7 +224,7 @@ def test_what_a_backward_program_chooses_beyond_a_prior_is_not_lost(inside: bool
 
 
 def test_touches_without_an_image_have_the_evidence_of_importance_sampling() -> None:
-    """The prior of a guess is a box: half a nat was lost with each window in free air."""
+    """The prior of a guess is a box."""
     recording = load_recording("peg_probe")
     recording = dataclasses.replace(recording, measurements=recording.measurements[2:8])
     model = look_and_touch.model.with_settings(profile="perfect")
@@ -240,4 +240,4 @@ def test_touches_without_an_image_have_the_evidence_of_importance_sampling() -> 
         for seed in range(3)
         for step in list(guided_smc.infer(model, recording, particles=500, seed=seed, scene=scene))[-1:]
     ]
-    assert max(abs(each - exact) for each in reached) < 0.15  # it was 1.2 below
+    assert max(abs(each - exact) for each in reached) < 0.15
