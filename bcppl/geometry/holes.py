@@ -66,15 +66,16 @@ def hole_of(part: Part, inside: tuple[float, float] | None = None, peg: Part | N
     """
     levels = _levels(part)
     layers = list(itertools.pairwise(levels))
-    sections = [_rings(part, 0.5 * (a + b)) for a, b in layers]
-    if not sections or not sections[0]:
+    sections = (_rings(part, 0.5 * (a + b)) for a, b in layers)
+    top = next(sections, [])
+    if not top:
         raise InputError(
             f"part {part.name!r} has no hole in its top; give a part with a hole along its z axis, or turn "
             "it with `Part.moved` until the hole points up."
         )
-    first = sections[0]
+    first = top
     if inside is not None:
-        first = [ring for ring in first if ring.contains(shapely.Point(inside))]
+        first = [ring for ring in top if ring.contains(shapely.Point(inside))]
         if not first:
             raise InputError(f"part {part.name!r} has no hole around {inside} m; give a point inside one.")
     if len(first) > 1:
@@ -88,18 +89,18 @@ def hole_of(part: Part, inside: tuple[float, float] | None = None, peg: Part | N
         """The hole of a ring in each of the first sections, down to the lower end of the last."""
         least, count = min(ring.area + _WIDER * ring.length for ring in rings), len(rings)
         narrowest = next(k for k, ring in enumerate(rings) if ring.area <= least)
-        ring, top = _room(part, rings[narrowest], layers[narrowest:count]), levels[0]
-        centre = np.array([ring.centroid.x, ring.centroid.y, top])
+        ring = _room(part, rings[narrowest], layers[narrowest:count])
+        centre = np.array([ring.centroid.x, ring.centroid.y, levels[0]])
         return Hole(
             np.concatenate([centre, [1.0, 0.0, 0.0, 0.0]]),
             translate(ring, -centre[0], -centre[1]),
-            top - levels[count],
-            top - levels[narrowest],
-            count == len(sections),
+            levels[0] - levels[count],
+            levels[0] - levels[narrowest],
+            count == len(layers),
         )
 
     rings: list[shapely.Polygon] = []
-    for section in sections:
+    for section in itertools.chain([top], sections):
         around = [ring for ring in section if ring.contains(middle)]
         if not around and rings and peg is not None and inside is None:
             # In the floor of a counterbore, beside its middle.
@@ -180,14 +181,25 @@ def _places(rings: list[shapely.Polygon]) -> str:
 
 def _room(part: Part, ring: shapely.Polygon, layers: list[tuple[float, float]]) -> shapely.Polygon:
     """What a hole of a ring leaves straight down some layers whose walls lean; the ring where none does."""
-    room = ring
+    room, (bottom, top) = ring, _leaning(part, ring)
     for high, low in layers:
+        if not ((bottom < high - _LEVEL) & (top > low + _LEVEL)).any():
+            continue
         for height in (high - _LEVEL, low + _LEVEL):
             ends = [end for end in _rings(part, height) if end.intersects(room)]
             narrower = [room.intersection(end) for end in ends]
             if narrower and min(each.area for each in narrower) < room.area - _WIDER * room.length:
                 room = max(shapely.get_parts(min(narrower, key=lambda each: each.area)), key=shapely.area)
     return room if isinstance(room, shapely.Polygon) and not room.is_empty else ring
+
+
+def _leaning(part: Part, ring: shapely.Polygon) -> tuple[Array, Array]:
+    """The lowest and the highest z (K,) of faces about a ring that lean by more than coordinates are rounded."""
+    lean = np.ptp(part.mesh.triangles[..., 2], axis=1) * np.abs(part.mesh.face_normals[:, 2])
+    leaning = part.mesh.triangles[lean > 0.5 * _WIDER]
+    lowest, highest = leaning.min(axis=1), leaning.max(axis=1)
+    about = (highest[:, :2] > ring.bounds[:2]) & (lowest[:, :2] < ring.bounds[2:])
+    return lowest[about.all(axis=1), 2], highest[about.all(axis=1), 2]
 
 
 def _takes(hole: Hole, peg: Part) -> bool:

@@ -107,9 +107,19 @@ def _layers(mesh: trimesh.Trimesh, tolerance: float) -> list[Layer]:
 
 
 def cross_section(mesh: trimesh.Trimesh, height: float) -> list[shapely.Polygon]:
-    """The polygons in which a mesh meets the plane z = height (m), in its x-y plane."""
-    path = mesh.section(plane_normal=[0.0, 0.0, 1.0], plane_origin=[0.0, 0.0, height])
-    return [] if path is None else [p.buffer(0.0) for p in path.to_2D(to_2D=np.eye(4))[0].polygons_full]
+    """The polygons in which a closed mesh meets the plane z = height (m), in its x-y plane."""
+    above, ends = mesh.vertices[:, 2] - height, mesh.edges_unique
+    # From the lower end: the edges on either side of a seam meet the plane in the same point, to the bit.
+    low, high = np.where((above[ends[:, 0]] < above[ends[:, 1]])[:, None], ends, ends[:, ::-1]).T
+    crosses = (above[low] < 0.0) & (above[high] >= 0.0)
+    start, stop = mesh.vertices[low[crosses]], mesh.vertices[high[crosses]]
+    points = np.empty((len(ends), 2))
+    points[crosses] = (start + (height - start[:, 2:]) / (stop - start)[:, 2:] * (stop - start))[:, :2]
+    sides = mesh.faces_unique_edges
+    cut = crosses[sides].sum(axis=1) == 2
+    segments = points[sides[cut][crosses[sides[cut]]].reshape(-1, 2)]
+    segments = segments[(segments[:, 0] != segments[:, 1]).any(axis=1)]
+    return polygons_of(shapely.build_area(shapely.multilinestrings(shapely.linestrings(segments))))
 
 
 def _section(mesh: trimesh.Trimesh, height: float) -> shapely.MultiPolygon:
