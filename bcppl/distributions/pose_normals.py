@@ -53,20 +53,18 @@ class GaussianMixture(NamedTuple):
 
     def times(self, factor: NormalPose) -> GaussianMixture:
         """The mixture that approximates its product with a Gaussian (...,)."""
-        center, spread = factor.center[..., None, :], factor.covariance[..., None, :, :]
-        second = NormalTwist(center, spread).covariance
-        own = torch.linalg.inv(NormalTwist(self.centers, self.covariances).covariance)
-        other = torch.linalg.inv(second)
+        center, second = factor.center[..., None, :], factor.covariance[..., None, :, :]
+        own, other = torch.linalg.inv(self.covariances), torch.linalg.inv(second)
         covariance = torch.linalg.inv(own + other)
         away = poses.log(self.centers, center)[..., None]
         both = self.covariances + second
         squared = (away[..., 0] * torch.linalg.solve(both, away)[..., 0]).sum(dim=-1)
         overlap = -0.5 * (squared + torch.linalg.slogdet(both)[1])
-        whole = NormalTwist(
+        return GaussianMixture(
             poses.exp(self.centers, (covariance @ other @ away)[..., 0]),
             0.5 * (covariance + covariance.transpose(-1, -2)),
+            self.log_weights + overlap,
         )
-        return GaussianMixture(whole.center, whole.covariance, self.log_weights + overlap)
 
 
 class PoseFactor(NamedTuple):

@@ -75,7 +75,13 @@ def hole_of(part: Part, inside: tuple[float, float] | None = None, peg: Part | N
         )
     first = top
     if inside is not None:
-        first = [ring for ring in top if ring.contains(shapely.Point(inside))]
+        try:
+            x, y = (float(each) for each in inside)
+        except (TypeError, ValueError):
+            raise InputError(
+                f"a hole is to be around {inside!r}; give x and y of a point inside one, metres."
+            ) from None
+        first = [ring for ring in top if ring.contains(shapely.Point(x, y))]
         if not first:
             raise InputError(f"part {part.name!r} has no hole around {inside} m; give a point inside one.")
     if len(first) > 1:
@@ -194,7 +200,7 @@ def _room(part: Part, ring: shapely.Polygon, layers: list[tuple[float, float]]) 
 
 
 def _leaning(part: Part, ring: shapely.Polygon) -> tuple[Array, Array]:
-    """The lowest and the highest z (K,) of faces about a ring that lean by more than coordinates are rounded."""
+    """The lowest and the highest z (K,) of faces about a ring that lean more than coordinates are rounded."""
     lean = np.ptp(part.mesh.triangles[..., 2], axis=1) * np.abs(part.mesh.face_normals[:, 2])
     leaning = part.mesh.triangles[lean > 0.5 * _WIDER]
     lowest, highest = leaning.min(axis=1), leaning.max(axis=1)

@@ -221,6 +221,11 @@ class GaussianApproximation:
         """The posterior of the part's pose, the nuisance parameters integrated out."""
         return self._posterior(self.adapted)
 
+    @cached_property
+    def widened(self) -> MixturePose:
+        """The mixture as an independence proposal of the part's pose."""
+        return widened_mixture(self.mixture)
+
     def _posterior(self, quadratic: QuadraticApproximation | None) -> GaussianMixture:
         prior = self.prior
         if quadratic is None:

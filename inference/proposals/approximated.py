@@ -68,7 +68,7 @@ def independent_proposal(given: GaussianApproximation) -> Callable[..., None]:
 
     def program(*args: Any) -> None:
         approximation = given.here
-        part = pyro.sample(approximation.pose, widened_mixture(approximation.mixture))
+        part = pyro.sample(approximation.pose, approximation.widened)
         known = NormalPose(part, part.new_zeros(6, 6) + _KNOWN * torch.eye(6, dtype=torch.float64))
         values: dict[str, Tensor] = {}
         for each in approximation.fits.values():
@@ -92,7 +92,7 @@ def joint_proposal(given: GaussianApproximation) -> Program:
 
     def program(trace: Trace) -> None:
         approximation = given.here
-        _follow(trace, approximation, widened_mixture(approximation.mixture), FOLLOWING)
+        _follow(trace, approximation, approximation.widened, FOLLOWING)
 
     return program
 

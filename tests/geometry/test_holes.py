@@ -13,6 +13,7 @@ import trimesh
 from bcppl.errors import InputError
 from bcppl.geometry.extrusion import block_with_hole, peg_for
 from bcppl.geometry.holes import fit_in, hole_of
+from bcppl.geometry.layers import cross_section
 from bcppl.geometry.outlines import round_outline
 from bcppl.geometry.parts import Part
 
@@ -127,3 +128,23 @@ def test_the_middle_of_a_bent_hole_may_lie_outside_it() -> None:
     corners = [(0, 0), (0.02, 0), (0.02, 0.004), (0.004, 0.004), (0.004, 0.02), (0, 0.02)]
     hole = hole_of(block_with_hole(shapely.Polygon(corners)))
     assert hole.through and hole.outline.area == pytest.approx(shapely.Polygon(corners).area)
+
+
+def test_a_cross_section_has_the_solid_s_area_also_at_vertices_and_of_a_mesh_of_single_triangles() -> None:
+    mesh = bored(straight(0.0, 0.03, 0.006), straight(0.009, 0.008, 0.04)).mesh
+    corners = np.arange(3 * len(mesh.faces)).reshape(-1, 3)
+    single = trimesh.Trimesh(mesh.triangles.reshape(-1, 3), corners, process=False)
+    wide, narrow = (SIDES / 8.0 * d**2 * math.sin(2.0 * math.pi / SIDES) for d in (0.03, 0.008))
+    floor = float(mesh.vertices[mesh.vertices[:, 2] < -0.005, 2].max())
+    for height, hole in ((-0.003, wide), (floor, narrow), (-0.010, narrow)):
+        for each in (mesh, single):
+            area = sum(polygon.area for polygon in cross_section(each, height))
+            assert area == pytest.approx(0.08 * 0.06 - hole, rel=1e-6)
+    assert cross_section(mesh, 0.001) == []
+    tilt = trimesh.transformations.rotation_matrix(0.7, [0.3, 1.0, 0.2])
+    for each in (mesh, single):
+        each.apply_transform(tilt)
+    expected = mesh.section(plane_normal=[0.0, 0.0, 1.0], plane_origin=[0.0, 0.0, 0.004])
+    expected, _ = expected.to_2D()
+    area = sum(polygon.area for polygon in cross_section(single, 0.004))
+    assert area == pytest.approx(expected.area, rel=1e-6)

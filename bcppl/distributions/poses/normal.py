@@ -28,6 +28,9 @@ class NormalPose(PoseDistribution):
             m rad and rad^2; or standard deviations (d,), metres then radians.
         freedom: which axes are free.
 
+    Attributes:
+        covariance: over the free coordinates, (d, d) or (N, d, d), in m^2, m rad and rad^2.
+
     The density is that of the normal over rotation vectors divided by d(Haar)/d(rotation vector)
     (Chirikjian, Stochastic Models, Information Theory, and Lie Groups, vol. 2, 10.6), summed over the
     windings next to the principal one where the spread is so wide that they matter.
@@ -53,7 +56,7 @@ class NormalPose(PoseDistribution):
                 "the covariance of NormalPose is not positive definite; "
                 "give every free axis a standard deviation above 0 (metres, radians)."
             )
-        self._scale = scale
+        self.covariance, self._scale = matrix, scale
         middle = torch.as_tensor(center, dtype=torch.float64)
         if bool(((middle[..., 3:].square().sum(dim=-1) - 1.0).abs() > 2e-3).any()):
             raise InputError(
@@ -61,11 +64,6 @@ class NormalPose(PoseDistribution):
                 "give x y z (m) qw qx qy qz, or normalise it with `poses.as_pose`."
             )
         super().__init__(middle, freedom)
-
-    @property
-    def covariance(self) -> Tensor:
-        """Over the free coordinates, (d, d) or (N, d, d), in m^2, m rad and rad^2."""
-        return self._scale @ self._scale.transpose(-1, -2)
 
     # Most are only drawn from or multiplied by others: what their density takes is made when it is asked for.
 
