@@ -94,7 +94,7 @@ def on_host() -> Iterator[None]:
 
 def is_on_host(tensor: Tensor) -> bool:
     """Whether compiled code of the processor can read a tensor as it is."""
-    return tensor.is_cpu
+    return tensor.device.type == "cpu"
 
 
 def numbers(tensor: Tensor) -> npt.NDArray[Any]:

@@ -22,6 +22,8 @@ import bcppl
 from bcppl import poses
 from bcppl.arrays import Array
 from bcppl.inference.live import Filter, Sampler
+from bcppl.inference.planning.constraints import Constraint
+from bcppl.inference.planning.motion_constraints import above_table
 from bcppl.robot.execution import Executor, Limits
 from bcppl.robot.plan import Plan, probe_of
 
@@ -159,7 +161,13 @@ def options(description: str | None) -> argparse.ArgumentParser:
     parser.add_argument("look", help="the recording to begin from")
     parser.add_argument("--probes", type=int, default=2)
     parser.add_argument("--profile", default="ur5e", help="of the bench, or a file")
+    parser.add_argument("--table", type=float, help="height (m) of a table that no touch may lead into")
     return parser
+
+
+def limits(recording: bcppl.Recording, table: float | None) -> list[Constraint]:
+    """What touches may not do."""
+    return [] if table is None else [above_table(recording.peg, table)]
 
 
 def main() -> None:
@@ -172,7 +180,7 @@ def main() -> None:
     model = bcppl.models.look_and_touch.model.with_settings(profile=arguments.profile)
     module, name = ARMS[arguments.robot]
     arm: Arm = getattr(importlib.import_module(module), name)(arguments.host)
-    with Filter(model, recording) as live:
+    with Filter(model, recording, constraints=limits(recording, arguments.table)) as live:
         touch_and_insert(arm, live, arguments.probes)
     arm.close()
 

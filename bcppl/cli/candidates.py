@@ -15,6 +15,7 @@ from bcppl.cli.arm import arm_with_peg
 from bcppl.errors import InputError
 from bcppl.geometry.gap import PegGap
 from bcppl.geometry.holes import hole_of
+from bcppl.geometry.parts import Part
 from bcppl.inference.planning.candidate_layout import MIXED, plan_candidates
 from bcppl.inference.planning.constraints import Candidates, Constraint, feasible, require_candidates
 from bcppl.inference.planning.generators import MOTIONS, candidate_kinds
@@ -78,7 +79,9 @@ def refuse_without_peg(asked: Asked, recording: Recording) -> None:
         )
 
 
-def constraints(force: float | None, seconds: float | None, above: float | None) -> list[Constraint]:
+def constraints(
+    force: float | None, seconds: float | None = None, above: float | None = None
+) -> list[Constraint]:
     """The constraints on candidates by force (N), duration (s) and angle from straight above (degrees)."""
     chosen = [] if seconds is None else [duration_at_most(seconds)]
     if force is not None:
@@ -87,6 +90,14 @@ def constraints(force: float | None, seconds: float | None, above: float | None)
         violation = f"approach at more than {above:g}° from straight above"
         chosen.append(approach_within((0.0, 0.0, -1.0), math.radians(above), violation))
     return chosen
+
+
+def above(table: float | None, peg: Part | None) -> list[Constraint]:
+    """The constraint on candidates by the height (m) of a table, where one is given."""
+    if table is None:
+        return []
+    number_within("--table is {}", table)
+    return [above_table(peg, table)]
 
 
 def reach(
@@ -129,9 +140,7 @@ def planned(
 
     Searches and attempts are for the hole around a point, m in the part's frame, where one is given.
     """
-    if table is not None:
-        number_within("--table is {}", table)
-        constraints = [above_table(recording.peg, table), *constraints]
+    constraints = [*above(table, recording.peg), *constraints]
     part, peg = recording.part, recording.peg
     hole = None if inside is None or peg is None else hole_of(part, inside, peg)
     if isinstance(asked, Mapping):

@@ -33,15 +33,16 @@ HOMES: dict[str, tuple[ModuleType, str, str]] = {
 }
 
 
-def recording(name: str, model_given: str | None = None) -> Recording:
+def recording(name: str, model_given: str | None = None, begun: bool = True) -> Recording:
     """The recording in a file, or a shipped one by name, checked, every measurement once.
 
+    Without `begun` it may hold none: part, guess and peg are what a first touch is planned for.
     Its sensors may be those that a model's file, which the command line gives, imports.
     """
     if model_given is not None and _is_file(model_given):
         model(model_given)
     loaded = load_recording(name)
-    validate(loaded)
+    validate(loaded, begun)
     return once_each(loaded)
 
 

@@ -41,6 +41,10 @@ Inside = Annotated[
     typer.Option(help="A point (m) in the hole, in the part's frame; needed where there are several: x y."),
 ]
 
+TableHeight = Annotated[float | None, typer.Option(help="Height (m) of a table that no plan may lead into.")]
+
+Force = Annotated[float | None, typer.Option(help="N; plans that press harder are left out.")]
+
 AsJson = Annotated[
     bool, typer.Option("--json", help="Print the result as JSON; all else goes to standard error.")
 ]

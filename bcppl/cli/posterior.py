@@ -49,7 +49,7 @@ def posterior(
         return _read(Path(name), of, model, settings, check)
     if of is not None:
         raise InputError(f"--of names a belief's recording, but {name} is a recording; leave it out.")
-    recording = loading.recording(name, model)
+    recording = loading.recording(name, model, begun=False)
     check(recording)
     named = model or recording.model
     chosen = _static(loading.with_settings(loading.model(model, recording.model), settings, named), named)

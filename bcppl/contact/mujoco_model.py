@@ -123,8 +123,8 @@ def build_model(part: Part, peg: Part, parameters: ContactParameters) -> mujoco.
     """
     if peg.vertices[:, 2].min() >= 0.0:
         warnings.warn(
-            f"peg {peg.name!r} lies wholly above its origin, the wrench sensor; a peg hangs below it, so "
-            "move it with `Part.moved` unless the sensor's z axis points down to the tip.",
+            f"peg {peg.name!r} lies wholly above its origin, where it is held; a peg hangs below it, so "
+            "move it with `Part.moved` unless its z axis points down to the tip.",
             RuntimeWarning,
             stacklevel=3,
         )

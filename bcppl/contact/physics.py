@@ -36,12 +36,13 @@ _FULL, _HALVED, _DIVERGED = 0, 1, 2
 class PegPhysics:
     """A peg held by a Cartesian spring-damper, and a fixed part, in MuJoCo.
 
-    The spring pulls the peg's origin (the wrench sensor) to the commanded one; stiffness and damping are the
+    The spring pulls the peg's origin (where it is held) to the commanded one; stiffness and damping are the
     probe's, along and about the commanded peg's axes; the damping acts on the velocity relative to the
     command's. Gravity is compensated. Everything is at rest before the first command.
 
     Attributes:
-        part, peg: the solids; the peg's frame has its origin at the wrench sensor.
+        part, peg: the solids; the peg's frame has its origin where it is held, about which
+            wrenches are simulated.
         parameters: of the contact and of the arm.
         share_free_motion: whether the motion before contact is simulated once for all particles; the results
             are the same to the bit.

@@ -149,12 +149,12 @@ def _pierced(
 def box_peg(width: float, length: float, breadth: float | None = None, name: str = "square peg") -> Part:
     """A peg of rectangular cross section.
 
-    The peg's frame: origin at the wrench sensor (the centre of the peg's upper end), z along the peg and
+    The peg's frame: origin at the centre of the peg's upper end, where it is held, z along the peg and
     away from the tip; the tip is at z = -length.
 
     Args:
         width: side length along x, metres.
-        length: from the sensor to the tip, metres.
+        length: from the upper end to the tip, metres.
         breadth: side length along y, metres; None for a square cross section.
         name: the part's name.
     """

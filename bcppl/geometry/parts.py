@@ -107,7 +107,7 @@ class Part:
     def moved(self, new_from_old: object, name: str | None = None) -> Part:
         """The same solid in another frame: a point p of the old frame becomes new_from_old p.
 
-        A peg whose mesh has its origin at the tip gets its frame at the wrench sensor, 50 mm above, with
+        A peg whose mesh has its origin at the tip gets its frame where it is held, 50 mm above, with
         `peg.moved([0, 0, -0.05, 1, 0, 0, 0])`. A box whose axes are not the new frame's becomes a hull.
 
         Args:
@@ -279,7 +279,7 @@ def load_mesh(
 
     Duplicate vertices, as of STL files and of seams of normals or textures, are merged: otherwise most closed
     meshes look open. All bodies of a file become one part. A mesh that is inside out is inverted, with a
-    warning. A peg's frame must have its origin at the wrench sensor, above the tip: where the file has it
+    warning. A peg's frame must have its origin where it is held, above the tip: where the file has it
     elsewhere, use `Part.moved`.
 
     Args:

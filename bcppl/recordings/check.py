@@ -34,13 +34,13 @@ def problems(recording: Recording) -> list[str]:
     return list(_problems(recording))
 
 
-def validate(recording: Recording) -> None:
-    """Refuse a recording that has a problem.
+def validate(recording: Recording, begun: bool = True) -> None:
+    """Refuse a recording that has a problem; one that is not `begun` may hold no measurement.
 
     Raises:
         InputError: the first of `problems`.
     """
-    for problem in _problems(recording):
+    for problem in _problems(recording, begun):
         raise InputError(problem)
 
 
@@ -79,7 +79,7 @@ def _touched(recording: Recording) -> bool:
     return any(sensor.contact for sensor, _ in by_sensor(recording.measurements))
 
 
-def _problems(recording: Recording) -> Iterator[str]:
+def _problems(recording: Recording, begun: bool = True) -> Iterator[str]:
     if wrong_types := list(_types(recording)):
         yield from wrong_types
         return
@@ -94,7 +94,7 @@ def _problems(recording: Recording) -> Iterator[str]:
             f"the recording names the file {recording.model!r} as its model; name an installed model, and "
             "give a file of your own where the recording is run."
         )
-    if not recording.measurements:
+    if begun and not recording.measurements:
         kinds = ", ".join(sensor.names[0] for sensor in sensors())
         yield f"the recording holds no measurement; record at least one ({kinds})."
     wrong = list(_strays(recording))

@@ -41,7 +41,8 @@ class Recording:
         part: the part whose pose is sought.
         guess: the prior.
         measurements: in the order in which they were taken.
-        peg: the held peg, its frame's origin at the wrench sensor's; None where nothing is held.
+        peg: the held peg, its frame's origin where it is held, about which wrenches are stated; None where
+            nothing is held.
         background: (by camera name) depth (H, W) in metres of the scene without the part, NaN where unknown.
         truth: (7,) true `world_from_part`, where known.
         model: the name of the model that explains it by default.

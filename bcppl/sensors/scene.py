@@ -183,12 +183,21 @@ def likelihoods_for(
 _KINDS = (str, bool, Sequence, Mapping)  # what is one of these is no number, and the other way round
 
 
+def _with_fields(what: str, default: Any, value: Mapping[str, Any]) -> Any:
+    """A default with some fields of its own, as the command line gives them."""
+    known = [field.name for field in fields(default)]
+    if not value or (unknown := [name for name in value if name not in known]):
+        wrong = f"has no field {unknown[0]!r}" if value else "is given no field"
+        raise InputError(f"{what} {wrong}; it has {', '.join(known)}.")
+    return replace(default, **value)
+
+
 def chosen(model: str, given: Mapping[str, Any], *defaults: Any) -> list[Any]:
     """The default settings, each with those of the given values that are its fields.
 
     Args:
         model: its name, for messages.
-        given: values by name.
+        given: values by name; of one that is a dataclass also a mapping of some of its fields.
         defaults: dataclasses.
 
     Raises:
@@ -202,6 +211,9 @@ def chosen(model: str, given: Mapping[str, Any], *defaults: Any) -> list[Any]:
     for each, own in zip(defaults, names, strict=True):
         for name in own.intersection(given):
             value, default = given[name], getattr(each, name)
+            if is_dataclass(default) and isinstance(value, Mapping):
+                given = {**given, name: _with_fields(f"setting {name!r} of {model}", default, value)}
+                continue
             kinds = (*_KINDS, type(default)) if is_dataclass(default) else _KINDS
             if default is not None and any(isinstance(value, k) != isinstance(default, k) for k in kinds):
                 raise InputError(

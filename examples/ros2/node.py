@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import sys
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -22,16 +22,17 @@ from nav_msgs.msg import Path
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
-from ros2.arm import ROSArm
+from ros2.arm import UNMOVED, ROSArm
 from ros2.messages import covariance_of, depth_of, header, path_of, pose_message, view_of
 from sensor_msgs.msg import CameraInfo, Image
-from touch_and_insert import options, touch_and_insert
+from touch_and_insert import limits, options, touch_and_insert
 
 import bcppl
 from bcppl.arrays import Array
 from bcppl.errors import InputError
 from bcppl.inference.filters.smc import Step
 from bcppl.inference.live import Filter, UpdateInfo
+from bcppl.inference.planning.constraints import Constraint
 from bcppl.robot.plan import Plan
 from bcppl.sensors import Recording
 from bcppl.traces import Model
@@ -47,6 +48,8 @@ class BeliefNode(Node):
             each is taken, and no more: those of a camera that stands still say the same.
         frame: of the poses that are published.
         particles: N.
+        peg_from_sensor: (7,) as of `ROSArm`.
+        constraints: of the touches that are planned, as of `Filter`.
 
     Attributes:
         arm: whose messages come to this node.
@@ -60,6 +63,8 @@ class BeliefNode(Node):
         cameras: Mapping[str, Array],
         frame: str = "world",
         particles: int = 75,
+        peg_from_sensor: Sequence[float] = UNMOVED,
+        constraints: Sequence[Constraint] = (),
     ) -> None:
         super().__init__("bcppl")
         self._frame, self._cameras = frame, dict(cameras)
@@ -68,8 +73,10 @@ class BeliefNode(Node):
         self._changed = threading.Condition()
         self._belief = self.create_publisher(PoseWithCovarianceStamped, "belief", 1)
         self._probe = self.create_publisher(Path, "next_probe", 1)
-        self.arm = ROSArm(self)
-        self.live = Filter(model, recording, particles=particles, on_update=self._updated)
+        self.arm = ROSArm(self, tuple(peg_from_sensor))
+        self.live = Filter(
+            model, recording, particles=particles, on_update=self._updated, constraints=constraints
+        )
         self.create_subscription(CameraInfo, "camera_info", self._informed, qos_profile_sensor_data)
         self.create_subscription(Image, "depth", self._seen, qos_profile_sensor_data)
 
@@ -136,6 +143,14 @@ def main() -> None:
         metavar=("FRAME", "X", "Y", "Z", "QW", "QX", "QY", "QZ"),
         help="a camera that stands still, and the pose of its optical frame",
     )
+    parser.add_argument(
+        "--peg-from-sensor",
+        nargs=7,
+        type=float,
+        default=UNMOVED,
+        metavar=("X", "Y", "Z", "QW", "QX", "QY", "QZ"),
+        help="of a wrist sensor that reads in its own axes: its pose in the peg's frame",
+    )
     rclpy.init(args=sys.argv)
     arguments = parser.parse_args(rclpy.utilities.remove_ros_args(sys.argv)[1:])
     recording = bcppl.load(arguments.look)
@@ -143,7 +158,13 @@ def main() -> None:
     if cameras:
         recording = replace(recording, measurements=[])
     model = bcppl.models.look_and_touch.model.with_settings(profile=arguments.profile)
-    node = BeliefNode(model, recording, cameras)
+    node = BeliefNode(
+        model,
+        recording,
+        cameras,
+        peg_from_sensor=arguments.peg_from_sensor,
+        constraints=limits(recording, arguments.table),
+    )
     executor = spun(node)
     with node.live:
         node.look()

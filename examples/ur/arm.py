@@ -1,6 +1,7 @@
 """A UR e-Series arm by ur_rtde: its sensors, and commands for `impedance.script` on its controller.
 
-The tool's centre point is set to the peg's frame, so that the pose is `world_from_peg` with the base as the
+The tool's centre point is set to the peg's frame, which has its origin where the peg is held and z towards
+the flange: half a turn about x from the usual one. So the pose is `world_from_peg` with the base as the
 world. Commands go through the controller's input registers: a target pose, and a stiffness.
 """
 

@@ -1,9 +1,9 @@
 """A simulated arm that speaks RTDE as a UR controller with `impedance.script` does: for trying programs.
 
-    python stand_in.py --seed 31000 --look look.h5
+    python -m ur.stand_in --seed 31000 --look look.h5
 
-serves at 127.0.0.1:30004, and writes what its two cameras see. `--pace client` moves the clock on with each
-command, so that a slow machine loses nothing.
+from the folder above serves at 127.0.0.1:30004, and writes what its two cameras see. `--pace client` moves
+the clock on with each command, so that a slow machine loses nothing.
 """
 
 from __future__ import annotations

@@ -31,7 +31,7 @@ from bcppl.inference.live.updates import UpdateInfo, affordable, resized
 from bcppl.inference.live.waiting import Waiting
 from bcppl.inference.live.worker import Worker
 from bcppl.inference.planning.candidate_layout import plan_candidates, require_uncertain
-from bcppl.inference.planning.constraints import Candidates, require_candidates
+from bcppl.inference.planning.constraints import Candidates, Constraint, require_candidates
 from bcppl.inference.planning.insertion import InsertionParameters, insertion_plan
 from bcppl.robot.arm_with_peg import ArmWithPeg
 from bcppl.robot.plan import InsertionPlan
@@ -65,6 +65,7 @@ class Filter:
             it in its probe, or ends the filter ("stop").
         on_update: called in the filter's thread with the step and what the update did, after each; it may
             rank and plan, and must not `settle`.
+        constraints: of the touches that `next_probe` plans (`bcppl.inference.planning.motion_constraints`).
 
     Raises:
         InputError: the recording has a problem, or a number is out of range.
@@ -81,12 +82,13 @@ class Filter:
         deadline: float = 0.5,
         on_fault: Literal["skip", "stop"] = "skip",
         on_update: Callable[[Step, UpdateInfo], None] | None = None,
+        constraints: Sequence[Constraint] = (),
     ) -> None:
         self.particles = whole_number("a live filter is to run {} particles", particles)
         self.deadline = number_within("a live filter has a deadline of {} s", deadline, above=0.0)
         if on_fault not in ("skip", "stop"):
             raise InputError(f"on_fault is {on_fault!r}; give 'skip' or 'stop'.")
-        self.model, self.seed = model, seed
+        self.model, self.seed, self.constraints = model, seed, constraints
         self._infer = default_inference(model)[1] if infer is None else infer
         self._on_fault, self._on_update = on_fault, on_update
         self._recording = replace(recording, measurements=[])
@@ -190,7 +192,7 @@ class Filter:
         """Candidates ranked for the newest belief, the best first.
 
         Args:
-            candidates: by default touches that are planned around the belief's mean.
+            candidates: by default touches that are planned around the belief's mean, within the constraints.
             rule: ranks them; by default the linearised expected information gain.
             timeout: seconds, after which `TimeoutError` is raised.
 
@@ -205,7 +207,8 @@ class Filter:
             listed = candidates
             if listed is None:
                 assert recording.peg is not None
-                listed = plan_candidates(step.belief, recording.part, recording.peg, seed=step.taken)
+                solids = recording.part, recording.peg
+                listed = plan_candidates(step.belief, *solids, constraints=self.constraints, seed=step.taken)
             own = listed if isinstance(listed, Candidates) else Candidates(tuple(listed))
             scene = self.model.prepare(with_candidates(recording, require_candidates(own)))
             return (rule or by_linearised_gain(self.model.pose))(step.population, own, scene)

@@ -171,7 +171,13 @@ class Session:
             hole = hole_of(recording.part, inside, recording.peg)
         plan = self.live.insertion(hole=hole, timeout=WAITS)
         layout = _layout("window").candidate
-        return {"search": layout.tree(plan.search), "push": layout.tree(plan.push)}
+        return {
+            "search": layout.tree(plan.search),
+            "push": layout.tree(plan.push),
+            "world_from_hole": plan.world_from_hole,
+            "depth": plan.depth,
+            "chamfer": plan.chamfer,
+        }
 
     def _begun(self) -> Sampler:
         if self._sampler is None:

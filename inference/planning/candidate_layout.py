@@ -56,7 +56,7 @@ def plan_candidates(
     Args:
         belief: over world_from_part.
         part: its z axis points out of its top.
-        peg: the held peg, its frame at the wrench sensor and its tip at its lowest z; None for views alone.
+        peg: the held peg, its frame where it is held and its tip at its lowest z; None for views alone.
         kinds: how many of "touch", "lean" (a touch with the peg turned), "slide", "pair" (two touches),
             "search", "attempt" and "view"; None: 12 touches, 4 that lean, 12 slides and 4 pairs.
         constraints: further ones (`bcppl.inference.planning.motion_constraints`).

@@ -128,7 +128,7 @@ def insertion_plan(
     Args:
         belief: over world_from_part.
         part: with the hole, its z axis out of its top.
-        peg: the held peg, its frame at the wrench sensor and its tip at its lowest z.
+        peg: the held peg, its frame where it is held and its tip at its lowest z.
         hole: of the part; `hole_of(part, peg=peg)` unless given.
         parameters: of the insertion.
 

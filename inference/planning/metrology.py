@@ -115,7 +115,7 @@ def three_two_one(
     Args:
         belief: over world_from_part.
         part: its z axis points out of its top.
-        peg: the held peg, its frame at the wrench sensor and its tip at its lowest z.
+        peg: the held peg, its frame where it is held and its tip at its lowest z.
         parameters: of the plan.
 
     Raises:

@@ -11,6 +11,7 @@ import re
 import shlex
 import sys
 from collections.abc import Iterator
+from dataclasses import fields
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,9 +24,12 @@ from typer.testing import CliRunner
 import bcppl
 from bcppl import poses
 from bcppl.cli import app
+from bcppl.contact.sensing.contact_detection import ContactDetector
+from bcppl.models.look_and_touch import CAMERAS
 from bcppl.recordings.beliefs import load_belief
 from bcppl.rendering.ray_casting import RayCaster
 from bcppl.sensors import protocol
+from bcppl.sensors.likelihoods.contact_probe import TouchSettings
 
 ROOT = Path(__file__).resolve().parents[2]
 README = ROOT / "README.md"
@@ -107,6 +111,22 @@ def test_readme_is_short_and_links_every_page() -> None:
     text = README.read_text(encoding="utf-8")
     assert len(text.splitlines()) <= MOST_LINES
     assert [page.name for page in PAGES[1:] if f"(docs/{page.name})" not in text] == []
+
+
+def test_settings_of_the_default_model_are_listed_with_their_defaults() -> None:
+    text = (ROOT / "docs/settings.md").read_text(encoding="utf-8")
+    listed = dict(re.findall(r"^\| `(\w+)` \| ([^|]*) \|", text, flags=re.MULTILINE))
+    own = {f.name: getattr(each, f.name) for each in (CAMERAS, TouchSettings()) for f in fields(each)}
+    assert listed.keys() == own.keys()
+    for name, default in own.items():
+        stated = listed[name]
+        if isinstance(default, bool) or default is None:
+            assert stated == ("none" if default is None else str(default).lower())
+        elif isinstance(default, ContactDetector):
+            assert stated == ", ".join(f"{each:g}" for each in vars(default).values())
+        else:
+            shown: Any = f'"{default}"' if isinstance(default, str) else pytest.approx(default, rel=1e-3)
+            assert (stated if isinstance(default, str) else float(stated)) == shown
 
 
 def test_modules_of_inference_are_named_as_they_are_imported() -> None:

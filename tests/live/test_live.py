@@ -20,6 +20,7 @@ from bcppl.errors import InferenceError, InputError
 from bcppl.inference import guided_smc
 from bcppl.inference.live import Filter, Sampler, play
 from bcppl.inference.live.waiting import Arrived, Waiting
+from bcppl.inference.planning.motion_constraints import above_table
 from bcppl.models import load_recording
 from bcppl.models.look_and_touch import model
 from bcppl.robot.motion import Probe
@@ -51,6 +52,16 @@ def halves(measurement: Measurement) -> list[Measurement]:
 
 
 FIELDS = ("times", "wrench", "world_from_peg")
+
+
+def test_touches_are_planned_within_the_constraints_of_the_filter(touched: Recording) -> None:
+    known = replace(touched, measurements=[])
+    high = above_table(touched.peg, 1.0)
+    with (
+        Filter(model, known, particles=FEW, constraints=[high]) as live,
+        pytest.raises(InputError, match="lead into the table"),
+    ):
+        live.next_probe()
 
 
 def test_windows_that_arrive_in_any_order_give_the_same_bits(touched: Recording) -> None:
@@ -125,7 +136,8 @@ def test_a_measurement_that_nothing_explains_is_left_out_or_ends_it(touched: Rec
     empty = replace(touched, measurements=[])
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        with Filter(model, empty, particles=FEW, infer=faulty, on_fault=policy) as live:
+        # Late windows would be joined, and the joined one begins with another stamp.
+        with Filter(model, empty, particles=FEW, infer=faulty, on_fault=policy, deadline=1e3) as live:
             for each in touched.measurements[:2]:
                 live.observe(each.action, each.observation)
             live.settle()

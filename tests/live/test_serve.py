@@ -24,6 +24,7 @@ from bcppl.inference.live.server import Server
 from bcppl.inference.live.session import Session
 from bcppl.models import load_recording
 from bcppl.models.look_and_touch import model
+from bcppl.robot.plan import InsertionPlan, Plan
 from bcppl.sensors import ProbeWindow, Recording
 
 
@@ -287,9 +288,18 @@ def test_a_field_that_is_unknown_is_not_passed_over(
 
 
 def test_an_insertion_is_into_the_hole_that_is_asked_for(session: Session) -> None:
+    def read(fields: Mapping[str, Any]) -> Plan:
+        return Plan(**{**fields, "manners": tuple(fields["manners"])})
+
     planned = session.answer({"ask": "insertion", "inside": [0.001, 0.0]})
     same = session.answer({"ask": "insertion"})
     np.testing.assert_array_equal(planned["push"]["world_from_peg"], same["push"]["world_from_peg"])
+    # What a client carries the push out with, from where the search has ended.
+    search, push = (read(same[name]) for name in ("search", "push"))
+    whole = InsertionPlan(search, push, same["world_from_hole"], same["depth"], same["chamfer"])
+    np.testing.assert_allclose(
+        whole.push_from(push.world_from_peg[0]).world_from_peg, push.world_from_peg, atol=1e-9
+    )
     assert "no hole around" in session.answer({"ask": "insertion", "inside": [0.028, 0.0]})["error"]
     assert "give two numbers in metres" in session.answer({"ask": "insertion", "inside": "middle"})["error"]
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from bcppl.contact.sensing.contact_detection import ContactDetector
 from bcppl.errors import InputError
 from bcppl.models import arm_in_view, grasped_peg, part_in_view
 from bcppl.sensors.likelihoods.camera_settings import CameraSettings
@@ -41,6 +42,17 @@ def test_no_setting_takes_nonsense(kind: Any, name: str) -> None:
         with pytest.raises(InputError) as refused:
             chosen("this model", {name: value}, kind())
         assert_one_sentence(str(refused.value))
+
+
+def test_fields_of_a_setting_are_given_by_name_and_the_others_stay() -> None:
+    (given,) = chosen("this model", {"contact_detector": {"contact": 4, "free": 2.0}}, TouchSettings())
+    assert given.contact_detector == ContactDetector(contact=4, free=2.0)
+    for value, sentence in (
+        ({"contacts": 4}, "no field 'contacts'; it has contact, free"),
+        ({"free": 9}, "free 9 N"),
+    ):
+        with pytest.raises(InputError, match=sentence):
+            chosen("this model", {"contact_detector": value}, TouchSettings())
 
 
 def test_a_median_and_a_spread_are_two_numbers() -> None:

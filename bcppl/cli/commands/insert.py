@@ -47,6 +47,9 @@ def insert(
         float, typer.Option(min=0.0001, max=0.1, help="m/s at most, where contact is expected.")
     ] = 0.02,
     force: Annotated[float, typer.Option(min=0.1, max=200.0, help="N; ends the push.")] = 20.0,
+    contact_force: Annotated[
+        float, typer.Option(min=0.1, max=50.0, help="N; ends the descent: above the noise of the sensor.")
+    ] = 0.7,
     workspace: Annotated[
         str | None,
         typer.Option(help=f"Corners of the box (m, in the world) that the peg's tip may not leave: {SIX}."),
@@ -101,7 +104,7 @@ def insert(
         search_speed=min(usual.search_speed, speed),
         push_speed=min(usual.push_speed, speed),
         push_force=force,
-        contact_force=min(usual.contact_force, force),
+        contact_force=min(contact_force, force),
     )
     hole = hole_of(part, point, peg)
     plan = insertion_plan(belief, part, peg, hole, careful)
@@ -112,6 +115,7 @@ def insert(
     mass, world_from_hole, covariance = hole_estimate(belief, hole, fit_in(hole, peg))
     place, deviation = 1e3 * world_from_hole[:3], _deviation(covariance)
     found |= {"world_from_hole": world_from_hole.tolist(), "deviation_mm": deviation, "mass": mass}
+    found |= {"depth": plan.depth, "chamfer": plan.chamfer}
     console.print(
         f"the hole is at {place[0]:.2f} {place[1]:.2f} {place[2]:.2f} mm, sure to {deviation[0]:.2f} mm "
         f"across and {deviation[1]:.2f} mm along its axis (standard deviations, relative to the peg)."

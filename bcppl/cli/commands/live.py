@@ -11,12 +11,14 @@ import typer
 from bcppl.arguments import LARGEST_SEED
 from bcppl.cli.options import (
     Arm,
+    Force,
     InferenceName,
     Link,
     LinkFromPeg,
     ModelName,
     Recorded,
     Settings,
+    TableHeight,
     WorldFromBase,
 )
 from bcppl.cli.outputs import refuse_overwriting
@@ -185,6 +187,8 @@ def serve(
         ),
     ] = None,
     view: VIEW = False,
+    table: TableHeight = None,
+    force: Force = None,
     set_: Settings = None,
 ) -> None:
     """Serve a live belief on a socket, in MessagePack (see docs/live.md), until it is interrupted."""
@@ -195,6 +199,7 @@ def serve(
 
     if find_spec("msgpack") is None:
         raise InputError("bcppl serve needs msgpack; pip install 'bcppl[serve]'.")
+    from bcppl.cli import candidates
     from bcppl.inference.live import Filter
     from bcppl.inference.live.server import Server
     from bcppl.inference.live.session import Session
@@ -206,9 +211,10 @@ def serve(
                 raise InputError(f"--out {out} has a {name} already; give another folder.")
         out.mkdir(parents=True, exist_ok=True)
     console = Console(highlight=False)
-    measured, chosen, infer = _chosen(scene, model, inference, set_)
+    measured, chosen, infer = _chosen(scene, model, inference, set_, begun=False)
+    limits = [*candidates.above(table, measured.peg), *candidates.constraints(force)]
     settings: dict[str, Any] = {"particles": particles, "seed": seed, "deadline": deadline}
-    with Filter(chosen, measured, infer=infer, **settings) as following:
+    with Filter(chosen, measured, infer=infer, constraints=limits, **settings) as following:
         if view:
             _asked(following.view(scene), console)
         server = Server(Session(following), host, port, token)
@@ -230,12 +236,12 @@ async def _serving(server: Server, console: Console) -> None:
 
 
 def _chosen(
-    name: str, model: str | None, inference: str | None, set_: list[str] | None
+    name: str, model: str | None, inference: str | None, set_: list[str] | None, begun: bool = True
 ) -> tuple[Recording, Model, Callable[..., Iterator[Step]]]:
     """The recording, the model with its settings, and the inference program."""
     from bcppl.cli import loading
 
-    measured = loading.recording(name, model)
+    measured = loading.recording(name, model, begun=begun)
     named = model or measured.model
     chosen = loading.with_settings(loading.model(model, measured.model), loading.settings(set_ or []), named)
     given, infer = loading.inference(inference, chosen)

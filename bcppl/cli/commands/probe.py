@@ -13,6 +13,7 @@ import typer
 from bcppl.arguments import LARGEST_SEED
 from bcppl.cli.options import (
     AsJson,
+    Force,
     Given,
     InferenceName,
     Inside,
@@ -22,6 +23,7 @@ from bcppl.cli.options import (
     Of,
     Particles,
     Settings,
+    TableHeight,
     WorldFromBase,
 )
 from bcppl.cli.outputs import files_of_run, refuse_overwriting
@@ -73,11 +75,9 @@ def probe(
     horizon: Annotated[
         int, typer.Option(min=1, max=2, help="1, or 2: the best probe after it counts as well.")
     ] = 1,
-    force: Annotated[float | None, typer.Option(help="N; plans that press harder are left out.")] = None,
+    force: Force = None,
     seconds: Annotated[float | None, typer.Option(help="Plans that last longer are left out.")] = None,
-    table: Annotated[
-        float | None, typer.Option(help="Height (m) of a table that no plan may lead into.")
-    ] = None,
+    table: TableHeight = None,
     inside: Inside = None,
     above: Annotated[
         float | None,
