@@ -8,7 +8,8 @@ from __future__ import annotations
 import os
 import sys
 import traceback
-from typing import Annotated
+import warnings
+from typing import Annotated, Any
 
 import typer
 
@@ -62,6 +63,7 @@ def main() -> None:
     words = sys.argv[1:] or ["--help"]
     if os.environ.get("BCPPL_TRACEBACK"):
         sys.exit(app(words, standalone_mode=False))
+    warnings.showwarning = _Warnings()
     try:
         sys.exit(app(words, standalone_mode=False))
     except typer.TyperException as error:
@@ -79,6 +81,19 @@ def main() -> None:
             "set BCPPL_TRACEBACK=1 to see the whole way, and report it if it is not in a file of yours.",
             FAILED,
         )
+
+
+class _Warnings:
+    """Prints each warning once, as a sentence and without a place in the source."""
+
+    def __init__(self) -> None:
+        self._printed: set[str] = set()
+
+    def __call__(self, message: Warning | str, *_: Any, **__: Any) -> None:
+        sentence = visible(" ".join(str(message).split()))
+        if sentence not in self._printed:
+            self._printed.add(sentence)
+            print(f"bcppl: warning: {sentence}", file=sys.stderr)
 
 
 def _stop(sentence: str, code: int) -> None:

@@ -302,3 +302,16 @@ def test_what_is_planned_is_planned_of_the_belief_that_was_kept(
     other = {**load_latent(here / "last.h5"), "part": belief.world_from_part.flip(0)}
     save_belief(belief, here / "other.h5", latent=other, **kept)
     refused(bcppl("insert", "other.h5", *words), "has other poses at 'part'")
+
+
+def test_a_first_touch_is_planned_before_anything_is_measured(
+    bcppl: Callable[..., Ran], tmp_path: Path
+) -> None:
+    """From part, guess and peg; what the plan is warned of is said once, without a place in the source."""
+    save(replace(load_recording("peg_probe"), measurements=[]), tmp_path / "none.h5")
+    ran = bcppl("probe", "none.h5", "--candidates", "touch:2", "--particles", 10)
+    assert ran.code == 0 and len(load_actions(tmp_path / "none_next.json")) == 1
+    warned = ran.err.strip().splitlines()
+    assert len(warned) == 1 and warned[0].startswith("bcppl: warning: a surface may be farther away")
+    ran = bcppl("run", "none.h5")
+    assert ran.code == 2 and "holds no measurement" in ran.err
