@@ -9,6 +9,8 @@ way back.
 
 from __future__ import annotations
 
+import os
+import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, TypeVar, cast
@@ -174,12 +176,35 @@ def seed_here(seed: int) -> None:
         torch.cuda.set_rng_state(torch.Generator(device).manual_seed(seed).get_state(), device)
 
 
+_LOCK = threading.RLock()
+
+
+def _unlock() -> None:
+    global _LOCK
+    _LOCK = threading.RLock()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_unlock)  # the thread that holds it stays behind
+
+
+@contextmanager
+def alone() -> Iterator[None]:
+    """What is run within is run by one thread of the process at a time.
+
+    Pyro's handlers, torch's generators, its default type and its number of threads are those of all threads.
+    """
+    with _LOCK:
+        yield
+
+
 @contextmanager
 def same_random_state() -> Iterator[None]:
     """Torch's generators, that of the run's device too, are afterwards as they were before."""
-    device = current_device()
-    state = random_state(device)
-    try:
-        yield
-    finally:
-        set_random_state(state, device)
+    with alone():
+        device = current_device()
+        state = random_state(device)
+        try:
+            yield
+        finally:
+            set_random_state(state, device)

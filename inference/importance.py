@@ -126,16 +126,17 @@ def generate_stratified(
         args: its arguments.
         observations: values by address, as for `generate`.
         particles: N.
-        strata: the number of intervals, by default N; or a function of values (M, *event) that returns the
-            number of each one's stratum, (M,) int64.
+        strata: the number of intervals of a real choice, by default N; or a function of values (M, *event)
+            that returns the number of each one's stratum, (M,) int64.
         candidates: the number for each particle, where `strata` is a function.
 
     Returns:
         The population. The variance of its evidence cannot be estimated from its founders.
 
     Raises:
-        InputError: a count is no whole number, 1 or more, there is no latent choice, there are fewer
-            particles than strata, or no inverse distribution function and no function given.
+        InputError: a count is no whole number, 1 or more, there is no latent choice, a number of strata is
+            given for a discrete one, there are fewer particles than strata, or no inverse distribution
+            function and no function given.
     """
     candidates = whole_number("generate_stratified is given {} candidates for each particle", candidates)
     if strata is not None and not callable(strata):
@@ -152,6 +153,11 @@ def generate_stratified(
         return generate(program, args, observations, particles, {address: values})
 
     if trace.distributions[address].has_enumerate_support:
+        if strata is not None:
+            raise InputError(
+                f"generate_stratified is given {strata} strata, and the first latent choice {address!r} is "
+                "discrete: each of its values is one; leave strata out."
+            )
         return _enumerated(started, trace, address)
     return _by_quantile(started, trace, address, particles if strata is None else strata)
 

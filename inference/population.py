@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection
 from dataclasses import dataclass, field, fields
-from functools import cached_property, partial
+from functools import partial
 from typing import TYPE_CHECKING, Any, NoReturn, overload
 
 import torch
@@ -14,6 +14,7 @@ from torch import Tensor
 from bcppl.arguments import latent_address
 from bcppl.beliefs import Belief, normalised
 from bcppl.beliefs.belief import ApparentPose, SeesPart
+from bcppl.cached import cached_property
 from bcppl.devices import HOST, to_device
 from bcppl.distributions.support import refuse_several_poses
 from bcppl.errors import InferenceError, InputError, OtherKindError
@@ -153,6 +154,10 @@ class Population:
         """
         log_weights = self.log_weights + log_factor
         highest = float(log_weights.max())
+        if math.isnan(highest):
+            # A particle without weight stays without, whatever has become possible with it.
+            log_weights = torch.where(self.log_weights == -torch.inf, -torch.inf, log_weights)
+            highest = float(log_weights.max())
         if not math.isfinite(highest):
             normalised(log_weights, self.trace.impossible())
         # One exponential serves the evidence and the effective sample size: it is what a step costs.

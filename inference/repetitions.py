@@ -23,7 +23,6 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
 from multiprocessing import get_context
 from typing import Any
 
@@ -34,6 +33,7 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.arguments import seed_number, whole_number
 from bcppl.beliefs import Belief, normalised
+from bcppl.cached import cached_property
 from bcppl.errors import InferenceError, InputError, NoWeightError
 from bcppl.inference.arviz import at_draws, check_alike, draw, import_arviz, population_of
 from bcppl.inference.population import Population

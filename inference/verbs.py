@@ -18,8 +18,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-import torch
-
 from bcppl.errors import InputError
 from bcppl.inference.filters.smcp3 import Pair, move_and_weight
 from bcppl.inference.filters.step import Observed
@@ -104,8 +102,6 @@ def update(population: Population, observed: Observed, pair: Pair | None = None)
     if pair is not None:
         return move_and_weight(population, pair, observed)
     trace, log_likelihood = extend(population.trace, *observed)
-    # A particle without weight stays without, whatever has become possible with it.
-    log_likelihood = torch.where(population.log_weights == -torch.inf, 0.0, log_likelihood)
     return population.with_trace(trace).reweighed(log_likelihood)
 
 

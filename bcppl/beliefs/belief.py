@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -25,6 +24,7 @@ from bcppl.beliefs.weights import (
     normalised,
     weighted_quantiles,
 )
+from bcppl.cached import cached_property
 from bcppl.devices import is_on_host, on_device_of
 from bcppl.errors import InputError
 from bcppl.poses import FREE, Freedom, as_pose

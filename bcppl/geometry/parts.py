@@ -6,7 +6,6 @@ import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,6 +14,7 @@ import numpy as np
 from bcppl import poses
 from bcppl.arguments import number_within
 from bcppl.arrays import Array, Indices, as_array
+from bcppl.cached import cached_property
 from bcppl.errors import InputError
 from bcppl.geometry.mesh_file import read_mesh
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from bcppl.arguments import pose_problem
+from bcppl.cached import cached_property
 from bcppl.devices import constant, is_on_host, numbers
 from bcppl.errors import InputError
 from bcppl.poses import kernels, quaternions

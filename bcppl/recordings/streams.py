@@ -6,12 +6,12 @@ A slow stream is interpolated at the stamps, a fast one averaged about them.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from bcppl.arrays import Array, Mask
+from bcppl.cached import cached_property
 
 FAST = 1.5  # rows for each stamp: a faster stream is averaged
 BRIDGED = 2.5  # median intervals that are interpolated, by default,
@@ -70,13 +70,14 @@ def is_known(stream: Stream, stamps: Array, longest: float | None) -> Mask:
     return np.asarray(inside & (stream.times[after] - stream.times[after - 1] <= longest))
 
 
-def values_at(stream: Stream, stamps: Array) -> Array:
+def values_at(stream: Stream, stamps: Array, step: float | None = None) -> Array:
     """Values (T, C) at even stamps, of a fast stream the mean over the time from one stamp to the next.
 
     The mean is centred at the stamp, at the stream's ends over less time, and that of the straight lines
-    between rows: it is right at any rate.
+    between rows: it is right at any rate. `step` (s) is that from one stamp to the next, where these are some
+    of more.
     """
-    step = float(stamps[1] - stamps[0]) if len(stamps) > 1 else stream.step
+    step = _step(stream, stamps) if step is None else step
     if step < FAST * stream.step:
         columns = [np.interp(stamps, stream.times, column) for column in stream.values.T]
         return np.stack(columns, axis=1)
@@ -88,17 +89,21 @@ def values_at(stream: Stream, stamps: Array) -> Array:
     return np.stack(means, axis=1) / (high - low)[:, None]
 
 
-def poses_at(stream: Stream, stamps: Array) -> Array:
+def _step(stream: Stream, stamps: Array) -> float:
+    return float(stamps[1] - stamps[0]) if len(stamps) > 1 else stream.step
+
+
+def poses_at(stream: Stream, stamps: Array, step: float | None = None) -> Array:
     """Poses (T, 7) at even stamps: positions as `values_at`, rotations along the geodesic, or their mean."""
-    position = values_at(Stream(stream.name, stream.times, stream.values[:, :3]), stamps)
-    step = float(stamps[1] - stamps[0]) if len(stamps) > 1 else stream.step
+    step = _step(stream, stamps) if step is None else step
+    position = values_at(Stream(stream.name, stream.times, stream.values[:, :3]), stamps, step)
     if step < FAST * stream.step:
         turns = Rotation.from_quat(stream.values[:, [4, 5, 6, 3]])
         within = np.clip(stamps, stream.times[0], stream.times[-1])
         quaternion = Slerp(stream.times, turns)(within).as_quat()[:, [3, 0, 1, 2]]
     else:
         near = _near_each_other(stream.values[:, 3:])
-        quaternion = values_at(Stream(stream.name, stream.times, near), stamps)
+        quaternion = values_at(Stream(stream.name, stream.times, near), stamps, step)
         quaternion = quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)
     return np.concatenate([position, quaternion], axis=1)
 

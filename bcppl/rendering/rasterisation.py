@@ -7,7 +7,7 @@ is proportional to the numbers of triangles and of fragments, so it suits all bu
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from typing import Any
 
 import igl
@@ -16,6 +16,7 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.arrays import Array, Indices, Mask, Numbers
+from bcppl.cached import cached_property
 from bcppl.devices import is_on_host
 from bcppl.effort import Effort
 from bcppl.geometry.camera import Camera

@@ -7,7 +7,6 @@ Without a GPU the renderer that `bcppl.rendering.rasterisation.renderer_for` giv
 
 from __future__ import annotations
 
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -17,6 +16,7 @@ from torch import Tensor
 
 from bcppl import poses, warp_arrays
 from bcppl.arrays import Array, Indices, Mask
+from bcppl.cached import cached_property
 from bcppl.devices import numbers
 from bcppl.effort import Effort
 from bcppl.geometry.camera import Camera

@@ -8,7 +8,6 @@ links, and the base is the root link of the URDF file.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
@@ -18,6 +17,7 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.arrays import Array
+from bcppl.cached import cached_property
 from bcppl.errors import InputError
 from bcppl.geometry.parts import Part
 from bcppl.robot.description import MOVING, Joint, chain_of, part_of, read

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 from torch import Tensor
 
+from bcppl.cached import cached_property
 from bcppl.distributions.support import Support
 from bcppl.traces.dependence.changes import changed
 from bcppl.traces.series import SeriesTrace

@@ -21,6 +21,7 @@ from pyro.poutine.subsample_messenger import _Subsample
 from torch import Tensor
 
 from bcppl.arguments import whole_number
+from bcppl.devices import alone
 from bcppl.distributions.lazy import LazyDistribution
 from bcppl.distributions.shortcuts import drawn, unvalidated
 from bcppl.distributions.support import Support
@@ -111,7 +112,7 @@ def run(
     particles = whole_number("a program was to be run for {} particles", particles)
     given = tensors(given)
     recorder = _Recorder(particles, given, draws_lazy)
-    with carrying(carried, particles) as used, graph(), unvalidated():
+    with alone(), carrying(carried, particles) as used, graph(), unvalidated():
         try:
             with _apart(), recorder, _Particles(PARTICLES, particles, dim=-1) as plate:
                 result = program(*args)

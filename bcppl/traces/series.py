@@ -24,13 +24,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property, reduce
+from functools import reduce
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from bcppl.arguments import whole_number
+from bcppl.cached import cached_property
 from bcppl.errors import InputError
 from bcppl.traces.carried import Entry
 from bcppl.traces.differentiation.graph import kept

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from types import MappingProxyType
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from bcppl.cached import cached_property
 from bcppl.distributions.support import Support, support_of
 from bcppl.errors import InputError
 from bcppl.traces.carried import Entry

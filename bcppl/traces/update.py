@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from bcppl.cached import cached_property
 from bcppl.errors import InputError
 from bcppl.traces.dependence.changes import changed
 from bcppl.traces.explained import other_addresses

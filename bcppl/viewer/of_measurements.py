@@ -8,7 +8,7 @@ return {"times": ..., "wrench": ...}
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import cached_property, singledispatch
+from functools import singledispatch
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from torch import Tensor
 
 from bcppl import poses as se3
 from bcppl.arrays import Array, Indices, Mask
+from bcppl.cached import cached_property
 from bcppl.errors import InputError
 from bcppl.figures.touches import contact_felt, tared_force
 from bcppl.geometry.camera import Camera

@@ -12,13 +12,14 @@ import math
 from collections import ChainMap
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from bcppl import poses
+from bcppl.cached import cached_property
 from bcppl.devices import HOST, current_device, on_host, to_device
 from bcppl.distributions.pose_normals import (
     GaussianMixture,

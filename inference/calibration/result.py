@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from bcppl.arrays import Array, Indices
+from bcppl.cached import cached_property
 from bcppl.errors import InputError
 from bcppl.inference.calibration.quantities import DENSITY, DISTANCE
 from bcppl.inference.calibration.ranks import p_value

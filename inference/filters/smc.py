@@ -21,6 +21,7 @@ from bcppl.arguments import seed_number, whole_number
 from bcppl.beliefs import Belief
 from bcppl.devices import (
     HOST,
+    alone,
     device_named,
     on_device,
     random_state,
@@ -87,18 +88,19 @@ def own_state(box: list[Tensor], particles: int, device: torch.device = HOST) ->
 
     What is made within is made on the device.
     """
-    outside, threads = random_state(device), torch.get_num_threads()
-    set_random_state(box[0], device)
-    # On a GPU the processor has what is small.
-    if particles < FEW_PARTICLES or device != HOST:
-        torch.set_num_threads(1)
-    try:
-        with on_device(device):
-            yield
-    finally:
-        box[0] = random_state(device)
-        set_random_state(outside, device)
-        torch.set_num_threads(threads)
+    with alone():
+        outside, threads = random_state(device), torch.get_num_threads()
+        set_random_state(box[0], device)
+        # On a GPU the processor has what is small.
+        if particles < FEW_PARTICLES or device != HOST:
+            torch.set_num_threads(1)
+        try:
+            with on_device(device):
+                yield
+        finally:
+            box[0] = random_state(device)
+            set_random_state(outside, device)
+            torch.set_num_threads(threads)
 
 
 @dataclass(frozen=True, eq=False)

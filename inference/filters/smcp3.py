@@ -44,6 +44,7 @@ from bcppl.inference.kernels.jacobian import (
     refuse_unequal,
 )
 from bcppl.inference.kernels.kernel import scattered, weighted
+from bcppl.inference.kernels.rejuvenation import of_program
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import Fittable, Proposal, program_of
 from bcppl.inference.resampling import Resample, adaptive, refuse_no_resampling
@@ -111,15 +112,16 @@ def move_and_weight(
         InferenceError: no particle has any weight left.
     """
     count = len(population)
-    if not isinstance(pair.forward, Fittable) and not isinstance(pair.backward, Fittable):
-        parts = [torch.arange(count)]
-    else:
+    learns = isinstance(pair.forward, Fittable) or isinstance(pair.backward, Fittable)
+    if learns:
         population = halved(population)
-        parts = halves(population)
+    parts = halves(population) if learns else [torch.arange(count)]
     log_factor = torch.zeros(count, dtype=torch.float64)
     whole: Trace | None = None
     for k, mine in enumerate(parts):
-        forward, backward = _fitted(pair, population[parts[-1 - k]])
+        # Where all are of one family, no other is apart: programs learn from draws of the model's.
+        apart = population[parts[-1 - k]] if len(parts) > 1 or not learns else of_program(population)
+        forward, backward = _fitted(pair, apart)
         old = population.trace[mine]
         trace, gained = moved_trace(forward, backward, old, observed, pair.check, ratio)
         if not (pair.inside or (observed is not None and isinstance(old, SeriesTrace))):
@@ -132,8 +134,6 @@ def move_and_weight(
         else:
             whole = scattered(whole, mine, trace)
     assert whole is not None
-    # A particle without weight stays without, wherever it is moved.
-    log_factor = torch.where(population.log_weights == -torch.inf, 0.0, log_factor)
     return population.with_trace(whole).reweighed(log_factor)
 
 

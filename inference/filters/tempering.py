@@ -137,6 +137,9 @@ def _likelihood_path(group: Sequence[str], later: Sequence[Sequence[str]]) -> Pa
     return Path(lambda trace: POSTERIOR.part(trace, group), target)
 
 
+_SWEEPS = 3
+
+
 @dataclass(frozen=True, eq=False)
 class Tempered:
     """A step that tempers: see `tempered`, which makes it."""
@@ -213,7 +216,7 @@ class Tempered:
 def tempered(
     kernel: Kernel | None = None,
     *,
-    sweeps: int | Until | Callable[[Trace], int | Until] = 3,
+    sweeps: int | Until | Callable[[Trace], int | Until] = _SWEEPS,
     resample: Resample | None = None,
     share: float | Callable[[Trace], float] = 0.5,
     exponents: Sequence[float] | None = None,
@@ -264,8 +267,9 @@ def tempered(
     if rejuvenation is None:
         default = where_left(kept if fixed is None else share_of(0.0))
         rejuvenation = resample_move(kernel, sweeps, default if resample is None else resample, always_move)
-    elif kernel is not None or resample is not None:
+    elif kernel is not None or resample is not None or always_move or sweeps != _SWEEPS:
         raise InputError(
-            "a step is given a rejuvenation beside a kernel or a resampling; give one or the other."
+            "a step is given a rejuvenation beside a kernel, sweeps or a resampling, which are its own; give "
+            "one or the other."
         )
     return Tempered(rejuvenation, Schedule(kept, fixed), by_site)

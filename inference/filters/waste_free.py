@@ -14,6 +14,7 @@ from bcppl.errors import InputError
 from bcppl.inference.filters.tempering import Rejuvenated, Rejuvenation
 from bcppl.inference.kernels import Kernel, fitted, halved, halves
 from bcppl.inference.kernels.kernel import refuse_no_kernel, scattered
+from bcppl.inference.kernels.rejuvenation import of_program
 from bcppl.inference.population import Population, log_pair
 from bcppl.inference.resampling import Scheme, systematic
 from bcppl.inference.targets import Target
@@ -57,7 +58,7 @@ def waste_free_moves(
         started = population[ancestors]
         parts = halves(started)
         others = [population.sides != started.sides[part[0]] for part in parts]
-        moves = [fitted(kernel, population[o] if bool(o.any()) else population) for o in others]
+        moves = [fitted(kernel, population[o] if bool(o.any()) else of_program(population)) for o in others]
         current, acceptances = started.trace, []
         kept = population[ancestors.repeat(count // chains)]
         whole = kept.trace

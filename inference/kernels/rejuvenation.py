@@ -159,7 +159,8 @@ def moved_by(population: Population, kernel: Kernel, target: Target, sweeps: int
     return Moved(population, acceptance, float(sweeps.displaced(start, population).min()))
 
 
-def _of_program(population: Population) -> Population:
+def of_program(population: Population) -> Population:
+    """Draws of the program, as many as there are particles: apart from all of them."""
     return Population(program_draws(population.trace), approximation=population.approximation)
 
 
@@ -171,7 +172,7 @@ def _sweep(population: Population, kernel: Kernel, target: Target) -> tuple[Popu
     parts, shares = halves(population), []
     for mine, others in zip(parts, parts[::-1], strict=True):
         # Fitted to those that are moved it would not leave the target invariant, where no other is apart.
-        apart = population[others] if len(parts) > 1 else _of_program(population)
+        apart = population[others] if len(parts) > 1 else of_program(population)
         move = fitted(kernel, apart)
         moved, share = move(population.trace[mine], target)
         shares.append(share.to(torch.float64))

@@ -100,6 +100,7 @@ class Sampler:
         self.probe = probe
         self._streams = {"wrench": _Messages(6), "pose": _Messages(7)}
         stamps = probe.stamps
+        self._step = float(np.median(np.diff(stamps))) if len(stamps) > 1 else None
         number = np.floor((stamps - stamps[0]) / window + 1e-6)
         self._ends = [*(np.flatnonzero(np.diff(number)) + 1).tolist(), len(stamps)]
         self._first, self._done = 0, -np.inf
@@ -163,13 +164,19 @@ class Sampler:
             until = float(self.probe.stamps[last - 1])
             if not all(m.times and m.times[-1] >= until + patience for m in self._streams.values()):
                 break
-            windows.append(self._window(last, until))
+            try:
+                windows.append(self._window(last, until))
+            except InputError:
+                if not windows or self.fault is None:
+                    raise
+                break  # what is complete counts; the next message is refused
         return windows
 
     def _window(self, last: int, until: float) -> Measurement:
         stamps = self.probe.stamps[self._first : last]
         streams = {name: self._known(name, stamps) for name in self._streams}
-        touch = Touch(stamps, values_at(streams["wrench"], stamps), poses_at(streams["pose"], stamps))
+        wrench, pose = streams["wrench"], streams["pose"]
+        touch = Touch(stamps, values_at(wrench, stamps, self._step), poses_at(pose, stamps, self._step))
         action = ProbeWindow(self.probe, self._first, last)
         self._first, self._done = last, until
         for messages in self._streams.values():

@@ -15,7 +15,7 @@ import numpy as np
 from bcppl.arrays import Array
 from bcppl.errors import InputError
 
-LARGEST = 32 << 20  # bytes of a message: a depth image of 2048 x 2048 as float64
+LARGEST = (32 << 20) + (64 << 10)  # bytes of a message: an image of 2048 x 2048 as float64, and its camera
 GREETING = 1 << 10  # bytes of a client's first message, which is read before its token is known
 MOST = 1 << 12  # maps and lists of a message: a row of numbers may be a list
 DEEPEST = 6  # maps or lists within one another
@@ -109,5 +109,6 @@ def _array(shape: Any, kind: str, data: Any) -> Array:
 
 def _packed_array(value: Any) -> Any:
     if isinstance(value, np.ndarray):
-        return {"shape": list(value.shape), "float64": np.ascontiguousarray(value, "<f8").tobytes()}
+        name = "float32" if value.dtype == np.float32 else "float64"
+        return {"shape": list(value.shape), name: np.ascontiguousarray(value, TYPES[name]).tobytes()}
     raise TypeError(f"a {type(value).__name__} cannot be sent")

@@ -5,6 +5,7 @@ The steps after it are those of the run that was not interrupted, to the bit.
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import asdict
 from typing import Any
 
@@ -19,7 +20,7 @@ from bcppl.inference.saved.populations import (
     population_of,
     write,
 )
-from bcppl.recordings import Recording
+from bcppl.recordings import Recording, once_each
 from bcppl.recordings.fingerprint import fingerprint
 from bcppl.traces import Model, Series
 
@@ -40,8 +41,14 @@ def save_step(step: Step, path: Location, recording: Recording) -> None:
     info = step.info._asdict()
     info["step"] = info["step"]._asdict()
     info["effort"] = {name: asdict(e) for name, e in info["effort"].items() if isinstance(e, Effort)}
-    run = {"taken": step.taken, "info": info, "of": fingerprint(recording, step.taken)}
+    run = {"taken": step.taken, "info": info, "of": fingerprint(_distinct(recording), step.taken)}
     write(path, {"populations": [population], "run": run}, step.random_state)
+
+
+def _distinct(recording: Recording) -> Recording:
+    """The recording as it is run: every measurement once. That is warned of where it is run."""
+    with warnings.catch_warnings(action="ignore"):
+        return once_each(recording)
 
 
 def load_step(path: Location, model: Model, recording: Recording, scene: Any = None) -> Step:
@@ -66,7 +73,7 @@ def load_step(path: Location, model: Model, recording: Recording, scene: Any = N
         if "run" not in content:
             raise InputError("it holds a population and no step of a run; use `bcppl.inference.saved.load`.")
         run, state = content["run"], content["random_state"]
-        taken = run["taken"]
+        taken, recording = run["taken"], _distinct(recording)
         if taken > len(recording.measurements) or run["of"] != fingerprint(recording, taken):
             raise InputError(
                 f"it is of a run that has assimilated {taken} measurements of another recording; "

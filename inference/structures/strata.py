@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import TYPE_CHECKING, NoReturn
 
 import torch
 from torch import Tensor
 
 from bcppl.beliefs import Belief, effective_sample_size, normalised
+from bcppl.cached import cached_property
 from bcppl.distributions.support import freedom_of, is_of_angles
 from bcppl.errors import InputError, OtherKindError
 from bcppl.inference.population import FIELDS, Population
@@ -103,11 +103,14 @@ class Strata:
             NoWeightError: no particle has any weight left.
             NotANumberError: a weight is NaN or +inf.
         """
-        # `replace` keeps nothing that was computed from the old weights.
-        return self._among(
-            (s, replace(each, log_weights=each.log_weights + log_factors[s]))
-            for s, each in self.populations.items()
-        )
+
+        def later(each: Population, log_factor: Tensor) -> Population:
+            # A particle without weight stays without, whatever has become possible with it.
+            possible = each.log_weights > -torch.inf
+            # `replace` keeps nothing that was computed from the old weights.
+            return replace(each, log_weights=each.log_weights + log_factor.where(possible, 0.0))
+
+        return self._among((s, later(each, log_factors[s])) for s, each in self.populations.items())
 
     def _among(self, parts: Iterable[tuple[Structure, Population]]) -> Strata:
         """The strata of some populations; the evidence changes as the sum of the weights does."""

@@ -162,9 +162,8 @@ def translate(
         return generate(program, args, observations, len(old), {**kept, **values})[0]
 
     new, log_factor = translated(old, forward, backward, renewed)
-    log_ratio = torch.where(population.log_weights == -torch.inf, 0.0, new.log_prob() - old.log_prob())
     moved = replace(population, trace=new, approximation=None)
-    return moved.reweighed(log_ratio + log_factor)
+    return moved.reweighed(new.log_prob() - old.log_prob() + log_factor)
 
 
 def sampling_nothing(trace: Trace) -> None:

@@ -15,7 +15,11 @@ from bcppl.errors import InputError
 from bcppl.inference.chains import markov_chains
 from bcppl.inference.filters.step import Observed
 from bcppl.inference.filters.tempering import tempered
-from bcppl.inference.importance import importance_sampling, tempered_importance_sampling
+from bcppl.inference.importance import (
+    generate_stratified,
+    importance_sampling,
+    tempered_importance_sampling,
+)
 from bcppl.inference.kernels import Move, metropolis_hastings
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import drift
@@ -216,3 +220,12 @@ def test_draws_of_an_lkj_prior_have_its_density(event: bool) -> None:
     prior = 0.75 * (1.0 - r.square())
     exact = torch.trapezoid(prior * dist.Normal(r, 0.3).log_prob(torch.tensor(0.9)).exp(), r)
     assert math.exp(population.log_evidence) == pytest.approx(float(exact), rel=0.03)
+
+
+def test_a_number_of_strata_is_refused_for_a_discrete_choice() -> None:
+    def program() -> None:
+        kind = pyro.sample("kind", dist.Categorical(torch.tensor([0.2, 0.3, 0.5])))
+        pyro.sample("y", dist.Normal(kind.double(), 1.0))
+
+    with pytest.raises(InputError, match="leave strata out"):
+        generate_stratified(program, (), {"y": torch.tensor(0.3).double()}, 6, 2)

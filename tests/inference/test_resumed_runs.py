@@ -7,6 +7,7 @@ import functools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from importlib.resources import as_file, files
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,6 +21,7 @@ from bcppl.inference.filters import bayes_contact, guided_smc, tempered_smc
 from bcppl.inference.filters.default import default_inference
 from bcppl.inference.filters.smc import Step
 from bcppl.inference.planning.metrology import three_two_one
+from bcppl.inference.saved import load_step, save_step
 from bcppl.models import (
     camera_error,
     grasped_peg,
@@ -319,3 +321,16 @@ def test_a_guided_run_is_resumed_from_a_tempered_one_with_the_same_approximation
 def test_a_second_run_on_the_same_scene_is_the_first() -> None:
     first = alone(FIRST, START, TOP)
     assert_same(first, guided(bench(FIRST, START, TOP), first[0].population.trace.args[0]))
+
+
+def test_a_run_over_a_measurement_that_is_held_twice_goes_on_from_its_file(tmp_path: Path) -> None:
+    recording = shipped("point_probe_10_pushes", 0, 1, 2)
+    first, *others = recording.measurements
+    twice = replace(recording, measurements=[first, replace(first), *others])
+    with pytest.warns(RuntimeWarning, match="repeats measurement 0"):
+        steps = list(bayes_contact.infer(point_probe.model, twice, particles=20))
+    save_step(steps[2], tmp_path / "step.h5", twice)
+    step = load_step(tmp_path / "step.h5", point_probe.model, twice)
+    with pytest.warns(RuntimeWarning, match="repeats measurement 0"):
+        *_, last = bayes_contact.infer(point_probe.model, twice, start=step)
+    assert last.info.log_evidence == steps[-1].info.log_evidence

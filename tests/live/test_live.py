@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 
+import bcppl
 from bcppl import poses
 from bcppl.arrays import Array
 from bcppl.errors import InferenceError, InputError
@@ -21,7 +22,7 @@ from bcppl.inference import guided_smc
 from bcppl.inference.live import Filter, Sampler, play
 from bcppl.inference.live.waiting import Arrived, Waiting
 from bcppl.inference.planning.motion_constraints import above_table
-from bcppl.models import load_recording
+from bcppl.models import load_recording, point_probe
 from bcppl.models.look_and_touch import model
 from bcppl.robot.motion import Probe
 from bcppl.robot.plan import Plan
@@ -394,3 +395,50 @@ def standing(name: str) -> Plan:
     knots = np.tile([0.0, 0.0, 0.1, 1.0, 0.0, 0.0, 0.0], (3, 1))
     times = np.array([0.0, 1.0, 2.0])
     return Plan(name, times, knots, ("free", "guarded"), 4.0, np.ones(6), np.ones(6))
+
+
+def test_what_was_complete_before_messages_were_lost_is_a_window() -> None:
+    """Both streams stop for .35 s after the first window's end, and go on."""
+    given = [each for each in messages((100.0, 100.0)) if not 10.265 < each[0] < 10.605]
+    sampler, got = Sampler(probe()), list[Measurement]()
+    with pytest.raises(InputError, match="too long to interpolate"):
+        for stamp, name, row in given:
+            got += getattr(sampler, name)(stamp, row)
+    assert [(w.action.first, w.action.last) for w in got] == [(0, 25)]
+    assert sampler.missing == 75 and sampler.fault is not None
+
+
+def test_a_window_of_one_stamp_is_averaged_as_the_others_are() -> None:
+    noise = np.random.default_rng(0).normal(size=(1300, 6))
+    times = np.arange(9.9, 11.2, 0.001)
+    still = [float(x) for x in poses.identity()]
+    sampler = Sampler(probe(0.76))
+    got = list[Measurement]()
+    for stamp, row in zip(times, noise, strict=True):
+        for name, values in (("wrench", row), ("pose", still)):
+            got += getattr(sampler, name)(float(stamp), values)
+    alone = got[-1]
+    assert alone.action.last - alone.action.first == 1
+    mean = noise[(times > 10.7449) & (times < 10.7551)].mean(axis=0)
+    np.testing.assert_allclose(alone.observation.wrench[0], mean, atol=0.2)
+
+
+def test_filters_and_a_run_in_other_threads_take_turns_to_the_same_bits() -> None:
+    recording = load_recording("point_probe_10_pushes")
+    pushes = replace(recording, measurements=recording.measurements[:2])
+    settings: dict[str, Any] = {"particles": 20, "seed": 1}
+    *_, alone = bcppl.infer(point_probe.model, pushes, **settings)
+    known = replace(pushes, measurements=[])
+    patient: dict[str, Any] = {**settings, "deadline": 1e3}
+    with (
+        Filter(point_probe.model, known, **patient) as one,
+        Filter(point_probe.model, known, **patient) as two,
+    ):
+        for each in pushes.measurements:
+            one.observe(each.action, each.observation)
+            two.observe(each.action, each.observation)
+        *_, here = bcppl.infer(point_probe.model, pushes, **settings)
+        beliefs = [here.belief, one.settle().belief, two.settle().belief]
+    for belief in beliefs:
+        assert torch.equal(belief.world_from_part, alone.belief.world_from_part)
+        assert torch.equal(belief.log_weights, alone.belief.log_weights)

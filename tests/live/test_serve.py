@@ -10,6 +10,7 @@ import tracemalloc
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import islice
 from typing import Any
 
 import msgpack
@@ -18,11 +19,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
 
 from bcppl.errors import InputError
+from bcppl.inference import guided_smc
 from bcppl.inference.live import Filter, server, wire
 from bcppl.inference.live.client import Client
 from bcppl.inference.live.server import Server
 from bcppl.inference.live.session import Session
-from bcppl.models import load_recording
+from bcppl.models import load_recording, peg_in_hole
 from bcppl.models.look_and_touch import model
 from bcppl.robot.plan import InsertionPlan, Plan
 from bcppl.sensors import ProbeWindow, Recording
@@ -324,3 +326,19 @@ def test_after_a_gap_rows_are_not_looked_at_any_more(session: Session) -> None:
     assert kept and kept < 200
     ended = session.answer({"ask": "end"})
     assert ended["windows"] == 0 and ended["missing"] > 200
+
+
+def test_a_probe_without_a_command_is_refused_where_that_is_simulated(touched: Recording) -> None:
+    first = touched.measurements[0]
+    unknown = replace(first.action.probe, stiffness=np.zeros(6))
+    recording = replace(touched, measurements=[replace(first, action=replace(first.action, probe=unknown))])
+    with pytest.raises(InputError, match="has no stiffness"):
+        next(islice(guided_smc.infer(peg_in_hole.model, recording, particles=20), 1, None))
+
+
+def test_the_largest_image_is_a_message_and_one_of_float32_stays_so() -> None:
+    image = np.zeros((2048, 2048))
+    wire.length_of(wire.packed({"ask": "view", "depth": image})[: wire.LENGTH.size])
+    half = wire.packed({"depth": image.astype(np.float32)})
+    assert len(half) < 0.51 * image.nbytes
+    assert wire.unpacked(half[wire.LENGTH.size :])["depth"].shape == (2048, 2048)

@@ -16,13 +16,13 @@ near it. Only the friction cone's margin is linearised.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from scipy.special import log_ndtr
 
 from bcppl.arguments import number_within
 from bcppl.arrays import Array, Indices
+from bcppl.cached import cached_property
 from bcppl.contact.sensing.load import refuse_millimetres
 from bcppl.contact.sensing.noise import WrenchNoise, covariance_of
 from bcppl.contact.sensing.surface import PegSurface

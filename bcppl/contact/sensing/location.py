@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 import torch
@@ -19,6 +18,7 @@ from torch import Tensor
 
 from bcppl.arguments import number_within, whole_number
 from bcppl.arrays import Array, ArrayRecord, Mask
+from bcppl.cached import cached_property
 from bcppl.compiled import compiled
 from bcppl.contact.sensing.load import ToolLoad, refuse_millimetres
 from bcppl.contact.sensing.surface import PegSurface

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +12,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from bcppl.arrays import Array, Indices, Mask
+from bcppl.cached import cached_property
 from bcppl.geometry.distance import closed_mesh
 from bcppl.geometry.parts import Part
 

@@ -6,7 +6,7 @@ import math
 import warnings
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass, field, replace
-from functools import cached_property, partial
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.arguments import number_within
 from bcppl.arrays import Array
+from bcppl.cached import cached_property
 from bcppl.devices import is_on_host, numbers, on_device_of
 from bcppl.distributions.checks import Check
 from bcppl.distributions.depth.camera_image import CameraImage

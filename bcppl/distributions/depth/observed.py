@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -12,6 +11,7 @@ import numpy.typing as npt
 from torch.utils.weak import WeakTensorKeyDictionary
 
 from bcppl.arrays import Array, Mask
+from bcppl.cached import cached_property
 from bcppl.distributions.depth.pixels import PixelLaw, log_totals
 from bcppl.errors import InputError
 

@@ -11,12 +11,13 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 
+from bcppl.cached import cached_property
 from bcppl.devices import HOST, on_host
 from bcppl.distributions.episodes.rows import COLUMNS, late
 from bcppl.errors import InputError

@@ -10,6 +10,8 @@ from torch import Tensor
 from bcppl.arguments import number_within
 from bcppl.errors import InputError
 
+_THINNED = 5e-5  # m by which a thinned path is off the one that was measured, at most
+
 
 class Located(NamedTuple):
     """The points of a path nearest to places (..., 3); metres."""
@@ -59,7 +61,7 @@ class Path:
         return Path(self.points[kept])
 
     def locate(self, places: Tensor) -> Located:
-        """The point of the path nearest to each of places (..., 3)."""
+        """The point of the path nearest to each of places (..., 3), the first of those that are as near."""
         if places.ndim > 1:
             return self._located(places)
         # Every site of every run of the program locates the same observed place.
@@ -71,7 +73,10 @@ class Path:
         from_start = places[..., None, :] - self.points[:-1]
         along = ((from_start * self._steps).sum(-1) / self._lengths**2).clamp(0.0, 1.0)
         off = (from_start - along[..., None] * self._steps).norm(dim=-1)
-        nearest = off.argmin(dim=-1)
+        # Of places that are as near, the first: a finger may come back the way that it has gone.
+        ahead = torch.nn.functional.pad(off[..., 1:], (0, 1), value=torch.inf)
+        near = (off <= off.amin(dim=-1, keepdim=True) + _THINNED) & (off <= ahead)
+        nearest = near.to(torch.uint8).argmax(dim=-1)
         share = along.gather(-1, nearest[..., None])[..., 0]
         return Located(
             self.travelled[nearest] + share * self._lengths[nearest],

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +13,7 @@ import pyro
 import torch
 from torch import Tensor
 
+from bcppl.cached import cached_property
 from bcppl.contact.touch import Touch
 from bcppl.distributions.parameters import COUNT, NONNEGATIVE, POSITIVE, RARE, check_parameters, within
 from bcppl.distributions.touch import ForceDirection, FreePath, Path, Placed, SharedError, SharedOnset
@@ -59,7 +60,7 @@ class FingerSettings:
     spread: float = field(default=0.000403, metadata=POSITIVE)
     varying: float = field(default=0.35, metadata=NONNEGATIVE)
     outlier: float = field(default=0.01, metadata=RARE)
-    friction: float = field(default=0.413, metadata=NONNEGATIVE)
+    friction: float = field(default=0.413, metadata=POSITIVE)
     direction_spread: float = field(default=0.0341, metadata=POSITIVE)
     direction_outlier: float = field(default=0.01, metadata=RARE)
     tolerance: float = field(default=0.000794, metadata=NONNEGATIVE)

@@ -154,7 +154,16 @@ class SimulatedProbe:
         """The rollout of a window's probe for parts at poses (N, 7), which all its windows share.
 
         `latent` are parameters of the contact (N,) by name.
+
+        Raises:
+            InputError: the probe has no stiffness: its command is not known.
         """
+        if not action.probe.stiffness.any():
+            raise InputError(
+                f"the probe {action.probe.name!r} has no stiffness, so that its command, which is simulated, "
+                "moves nothing; give the plan that was executed, or take a model that needs none "
+                "(look_and_touch)."
+            )
         nuisances = self.nuisances
         if latent:
             nuisances = replace(nuisances or Nuisances(), **latent)

@@ -8,16 +8,17 @@ that an error costs an evaluation and never gives a wrong density.
 Two values are the same if they are one object; tensors or arrays that are equal to the bit; containers,
 objects, partial applications, or functions with equal code, whose parts are the same. Parts that cache what
 the others determine do not count: the attributes that a class names in `__caches__`, and the values of
-`functools.cached_property` where not both have one or it is no number and no array.
+a `cached_property` where not both have one or it is no number and no array.
 What is stored neither in a value nor in its parts is not seen: a write into an object that both runs share.
 Global variables that a lazy site reads are compared besides (`bcppl.traces.dependence.surroundings`).
 """
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cached_property, lru_cache, partial
+from functools import lru_cache, partial
 from struct import calcsize
 from types import (
     BuiltinMethodType,
@@ -36,6 +37,8 @@ import torch
 from torch import Tensor
 from torch.distributions.transforms import Transform, _InverseTransform
 from torch.distributions.utils import lazy_property
+
+from bcppl.cached import cached_property
 
 Array = Tensor | npt.NDArray[Any]
 
@@ -258,7 +261,7 @@ def _layout(kind: type) -> _Layout:
     slots, computed, cached = {}, set(), set()
     for base in kind.__mro__:
         for name, each in vars(base).items():
-            if isinstance(each, cached_property):
+            if isinstance(each, (cached_property, functools.cached_property)):
                 cached.add(name)
             elif isinstance(each, lazy_property):
                 computed.add(name)

@@ -250,3 +250,14 @@ def test_free_path_counts_to_one_and_ends_at_the_onset() -> None:
     assert torch.allclose(free.log_prob(t(1.0)[0]), exact, atol=1e-6)
     whole = FreePath(free.distance, pose, path, t(math.nan, math.nan, math.nan), 0.001, 0.0005)
     assert float(whole.log_prob(t(1.0)[0])[1]) < -100.0
+
+
+def test_a_finger_that_comes_back_the_way_that_it_went_has_touched_on_the_way_out() -> None:
+    out = straight((-0.06, 0.0, 0.0), (-0.03, 0.0, 0.0), 601).points
+    scattered = 2e-6 * torch.randn(out.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    both = Path(torch.cat([out, (out + scattered).flip(0)])).thinned(0.0005)
+    # Off the path by a few micrometres, as what is interpolated between stamps.
+    places = torch.stack([t(x, 3e-6, 0.0) for x in (-0.0597, -0.0503, -0.0411, -0.0302)])
+    one, other = Path(out).thinned(0.0005).locate(places), both.locate(places)
+    torch.testing.assert_close(other.travelled, one.travelled, atol=1e-5, rtol=0.0)
+    torch.testing.assert_close(other.direction, one.direction, atol=1e-2, rtol=0.0)

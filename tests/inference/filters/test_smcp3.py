@@ -17,9 +17,11 @@ from bcppl.distributions.poses import NormalPose
 from bcppl.errors import InputError
 from bcppl.inference.filters import smcp3
 from bcppl.inference.filters.smcp3 import Pair, move_and_weight
+from bcppl.inference.importance import importance_sampling
 from bcppl.inference.kernels.jacobian import Charted, Real, Tangent
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import drift
+from bcppl.inference.proposals.proposal import Fittable
 from bcppl.poses import Freedom
 from bcppl.traces import Trace, simulate
 from tests.inference.filters.smcp3_programs import flat, nothing, silent
@@ -294,3 +296,21 @@ def test_pairs_that_are_refused_name_the_address() -> None:
         mixing,
         unshift,
     )
+
+
+def test_one_particle_is_moved_by_a_program_that_has_not_seen_it() -> None:
+    """Where none is apart, programs learn from draws of the model's; before, Z of one particle was 10."""
+    seen: list[Tensor] = []
+
+    def learning(population: Population) -> Callable[[Trace], None]:
+        seen.append(population["x"].clone())
+        return lambda trace: pyro.sample("x", dist.Normal(number(0.0), 1.0)) and None
+
+    one = importance_sampling(normal, (), {}, 1)
+    pair = Pair(Fittable(learning), Fittable(learning))
+    move_and_weight(one, pair)
+    assert len(seen) == 2 and not any(bool((each == one["x"]).any()) for each in seen)
+
+
+def normal() -> None:
+    pyro.sample("x", dist.Normal(number(0.0), 1.0))

@@ -13,13 +13,16 @@ from torch import Tensor
 from bcppl.beliefs import normalised
 from bcppl.errors import InferenceError, InputError
 from bcppl.inference.exponents import conditional_effective_sample_size, next_exponent
+from bcppl.inference.filters.smcp3 import Pair, move_and_weight
 from bcppl.inference.filters.step import Observed
 from bcppl.inference.filters.tempering import tempered
+from bcppl.inference.filters.waste_free import waste_free_moves
 from bcppl.inference.importance import importance_sampling
 from bcppl.inference.kernels import metropolis_hastings
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import drift
 from bcppl.inference.resampling import Resample, adaptive, always, never
+from bcppl.inference.verbs import update
 from bcppl.traces import generate
 
 
@@ -131,3 +134,37 @@ def test_old_sites_that_new_arguments_change_are_weighed(by_site: bool) -> None:
     exact = dist.Normal(number(0.0), math.sqrt(9.125)).log_prob(number(2.25))
     exact = exact + dist.Normal(number(0.0), math.sqrt(0.5)).log_prob(number(0.5))
     assert population.log_evidence == pytest.approx(float(exact), abs=0.1)
+
+
+def within(bound: float, count: int) -> None:
+    """A reading lies within a bound of x that a later argument refines."""
+    x = pyro.sample("x", dist.Normal(number(0.0), 1.0))
+    pyro.sample("y_0", dist.Uniform(x - bound, x + bound))
+    for k in range(1, count):
+        pyro.sample(f"y_{k}", dist.Normal(x, 1.0))
+
+
+def test_a_particle_that_was_impossible_stays_so_where_new_arguments_allow_it() -> None:
+    observed = Observed((2.0, 2), {"y_1": number(0.3)})
+    population = importance_sampling(within, (1.0, 1), {"y_0": number(0.3)}, 200)
+    dead = population.log_weights == -torch.inf
+    assert 20 < int(dead.sum()) < 180
+    expected = update(population, observed)
+    assert bool((expected.log_weights[dead] == -torch.inf).all())
+    for later in (
+        tempered(resample=never)(population, observed).population,
+        smcp3_still(population, observed),
+    ):
+        torch.testing.assert_close(later.log_weights, expected.log_weights)
+        assert later.log_evidence == pytest.approx(expected.log_evidence)
+
+
+def smcp3_still(population: Population, observed: Observed) -> Population:
+    return move_and_weight(population, Pair(lambda trace: None, lambda trace: None), observed)
+
+
+def test_a_rejuvenation_has_its_own_sweeps() -> None:
+    own = waste_free_moves(metropolis_hastings(drift("x")), 4)
+    for settings in ({"sweeps": 50}, {"always_move": True}):
+        with pytest.raises(InputError, match="rejuvenation beside a kernel, sweeps"):
+            tempered(rejuvenation=own, **settings)  # type: ignore[arg-type]

@@ -115,3 +115,21 @@ def test_a_jump_that_nobody_made_in_a_round_has_no_share_of_it() -> None:
     rounds = iter([(math.nan, 0.5), (0.25, math.nan)] * 2)
     both = in_turn(lambda strata, target: MovedStrata(strata, next(rounds)), times=2)
     assert both(exact_strata(10), POSTERIOR).acceptance == (0.25, 0.5)
+
+
+def test_a_particle_that_was_impossible_stays_so_where_new_arguments_allow_it() -> None:
+    def program(bound: float, count: int) -> None:
+        kind = structural("kind", dist.Bernoulli(number(0.5)))
+        x = pyro.sample("x", dist.Normal(number(0.0), 1.0 + float(kind)))
+        pyro.sample("y_0", dist.Uniform(x - bound, x + bound))
+        for k in range(1, count):
+            pyro.sample(f"y_{k}", dist.Normal(x, 1.0))
+
+    strata = generate_strata(program, (1.0, 1), {"y_0": number(0.3)}, 200)
+    observed = Observed((2.0, 2), {"y_1": number(0.3)})
+    later = extend_strata(strata, observed)
+    dead = torch.cat([p.log_weights == -torch.inf for p in strata.populations.values()])
+    still = torch.cat([p.log_weights == -torch.inf for p in later.populations.values()])
+    assert bool(dead.any()) and torch.equal(dead, still)
+    tempered = tempered_strata(share=0.0).extend(strata, observed).strata
+    assert tempered.log_evidence == pytest.approx(later.log_evidence)

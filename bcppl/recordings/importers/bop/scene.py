@@ -21,7 +21,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +28,7 @@ import numpy as np
 import torch
 
 from bcppl.arrays import Array
+from bcppl.cached import cached_property
 from bcppl.errors import InputError
 from bcppl.poses import from_rotation_matrix, inverse
 from bcppl.recordings.importers.bop.images import COLOURS, DEPTHS
