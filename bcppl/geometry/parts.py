@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 LARGEST_EXTENT = 5.0  # m: a larger mesh is in millimetres
+FARTHEST = 3.0  # half widths of a guess's translation that its tails reach
+ROUNDING = 1e-9  # m, rad
 LARGEST_UNSCALED = 1.0  # m: the same of a mesh file without a stated scale
 
 
@@ -260,6 +262,19 @@ class Guess:
     def __post_init__(self) -> None:
         for name in ("world_from_part", "translation"):
             object.__setattr__(self, name, as_array(getattr(self, name)))
+
+    def allows(self, world_from_part: Array) -> bool:
+        """Whether a pose (7,) is within the bounds, tails included."""
+        away = np.abs(np.asarray(world_from_part)[:3] - self.world_from_part[:3])
+        if (away > FARTHEST * self.translation + ROUNDING).any():
+            return False
+        guess, there = self.world_from_part[3:], np.asarray(world_from_part)[3:]
+        w = abs(float(guess @ there))
+        x, y, z = guess[0] * there[1:] - there[0] * guess[1:] - np.cross(guess[1:], there[1:])
+        if self.angle is not None:
+            return 2.0 * math.atan2(math.hypot(x, y, z), w) <= self.angle + ROUNDING
+        tilt, yaw = 2.0 * math.atan2(math.hypot(x, y), math.hypot(w, z)), 2.0 * math.atan2(abs(z), w)
+        return tilt <= self.tilt + ROUNDING and yaw <= self.yaw + ROUNDING
 
     def farthest(self, point: Array) -> float:
         """How far (m) a point (3,) of the part may be from where it is at the guess, within the bounds."""

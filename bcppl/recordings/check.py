@@ -56,6 +56,12 @@ def _notes(recording: Recording) -> Iterator[str]:
             f"part {part.name!r} has an open mesh, or faces wound both ways: it can be looked at, as here, "
             "but not touched."
         )
+    if recording.truth is not None and not (problems(recording) or recording.guess.allows(recording.truth)):
+        away = np.linalg.norm(np.asarray(recording.truth)[:3] - recording.guess.world_from_part[:3])
+        yield (
+            f"the truth, {1e3 * away:.0f} mm from the guess, is impossible by the guess: no belief will "
+            "reach it; widen the guess, or see which of the two is wrong."
+        )
     known = _installed_models()
     if recording.model not in known:
         close = get_close_matches(recording.model, known, 1)

@@ -91,3 +91,16 @@ def test_proposals_are_the_normal_times_the_prior(beside: float) -> None:
     mean = (share[:, None] * tangent).sum(dim=0) / share.sum()
     scale = covariance.diagonal().sqrt()
     assert float(((poses.local(center, inside.center)[0] - mean) / scale).abs().max()) < 0.1
+
+
+@pytest.mark.parametrize("bounds", [{"tilt": 0.3, "yaw": 0.5}, {"angle": 0.4}, {"tilt": 0.0, "yaw": math.pi}])
+def test_a_guess_allows_what_its_prior_does(bounds: dict[str, float]) -> None:
+    center = poses.as_pose([0.1, -0.2, 0.3, 0.5, 0.5, -0.5, 0.5])
+    guess = Guess(center.numpy(), [0.02, 0.01, 0.0], **bounds)
+    away = torch.randn(400, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    away = away * torch.tensor([0.03, 0.015, 0.0, 0.2, 0.2, 0.3], dtype=torch.float64)
+    away[::2, 3:5] = 0.0
+    there = poses.retract(center, away)
+    possible = torch.isfinite(prior_from_guess(guess).log_prob(there))
+    assert possible.any() and not possible.all()
+    assert [guess.allows(each) for each in there.numpy()] == possible.tolist()

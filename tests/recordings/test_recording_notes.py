@@ -77,3 +77,14 @@ def test_a_calibration_of_another_image_size_is_noted_with_both_sizes() -> None:
     (found,) = noted(measurements=seen_by(fx=18.0, fy=19.0, cx=7.5, cy=5.5))
     assert "camera 'left'" in found and "16×12 pixels, but its images are 8×6" in found
     assert noted(measurements=seen_by(cx=5.0, cy=1.0)) == []
+
+
+def test_a_truth_that_the_guess_excludes_is_noted() -> None:
+    recording = load_recording("peg_probe")
+    assert recording.truth is not None
+    truth = np.array(recording.truth)
+    truth[0] += 0.3
+    elsewhere = replace(recording, truth=truth)
+    (note,) = notes(elsewhere)
+    assert_one_sentence(note)
+    assert "the truth, 295 mm from the guess, is impossible" in note

@@ -16,13 +16,15 @@ from bcppl.devices import numbers, on_device_of
 from bcppl.distributions.parameters import Range
 from bcppl.distributions.poses.base import HELD, PoseDistribution, is_unit
 from bcppl.errors import InputError
+from bcppl.geometry.parts import FARTHEST
 from bcppl.poses import Freedom, quaternions
 
 ANGLE = Range(least=0.0, most=math.pi)
 SHARE = Range(least=0.0, below=1.0)
-# A guess is a belief, not a fact. So much of each coordinate's mass lies in its tails, which reach so many
-# half widths from the centre: measurements that are worth 6 nats more outside move the belief there.
-TAIL, FARTHEST = 0.01, 3.0
+# A guess is a belief, not a fact. So much of each coordinate's mass lies in its tails, which reach
+# `FARTHEST` half widths from the centre: measurements that are worth 6 nats more outside move the belief
+# there.
+TAIL = 0.01
 
 
 class BoxPose(PoseDistribution):
