@@ -252,8 +252,8 @@ def tempered(
 
     Raises:
         InputError: what is given is no kernel, `share` is not in [0, 1), `sweeps` is no whole number, 1 or
-            more, the exponents do not increase to 1, or a rejuvenation is given beside a kernel or a
-            resampling.
+            more, the exponents do not increase to 1, or a rejuvenation is given beside a kernel,
+            sweeps or a resampling.
     """
     if kernel is not None:
         refuse_no_kernel("tempered", kernel)
