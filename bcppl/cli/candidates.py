@@ -92,7 +92,7 @@ def constraints(
     return chosen
 
 
-def above(table: float | None, peg: Part | None) -> list[Constraint]:
+def off_table(table: float | None, peg: Part | None) -> list[Constraint]:
     """The constraint on candidates by the height (m) of a table, where one is given."""
     if table is None:
         return []
@@ -140,7 +140,7 @@ def planned(
 
     Searches and attempts are for the hole around a point, m in the part's frame, where one is given.
     """
-    constraints = [*above(table, recording.peg), *constraints]
+    constraints = [*off_table(table, recording.peg), *constraints]
     part, peg = recording.part, recording.peg
     hole = None if inside is None or peg is None else hole_of(part, inside, peg)
     if isinstance(asked, Mapping):

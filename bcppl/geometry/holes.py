@@ -81,7 +81,8 @@ def hole_of(part: Part, inside: tuple[float, float] | None = None, peg: Part | N
             raise InputError(
                 f"a hole is to be around {inside!r}; give x and y of a point inside one, metres."
             ) from None
-        first = [ring for ring in top if ring.contains(shapely.Point(x, y))]
+        inside = x, y
+        first = [ring for ring in top if ring.contains(shapely.Point(inside))]
         if not first:
             raise InputError(f"part {part.name!r} has no hole around {inside} m; give a point inside one.")
     if len(first) > 1:

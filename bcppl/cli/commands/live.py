@@ -212,7 +212,7 @@ def serve(
         out.mkdir(parents=True, exist_ok=True)
     console = Console(highlight=False)
     measured, chosen, infer = _chosen(scene, model, inference, set_, begun=False)
-    limits = [*candidates.above(table, measured.peg), *candidates.constraints(force)]
+    limits = [*candidates.off_table(table, measured.peg), *candidates.constraints(force)]
     settings: dict[str, Any] = {"particles": particles, "seed": seed, "deadline": deadline}
     with Filter(chosen, measured, infer=infer, constraints=limits, **settings) as following:
         if view:

@@ -299,7 +299,7 @@ def test_pairs_that_are_refused_name_the_address() -> None:
 
 
 def test_one_particle_is_moved_by_a_program_that_has_not_seen_it() -> None:
-    """Where none is apart, programs learn from draws of the model's; before, Z of one particle was 10."""
+    """Where no other is apart, programs learn from draws of the model's."""
     seen: list[Tensor] = []
 
     def learning(population: Population) -> Callable[[Trace], None]:
