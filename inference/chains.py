@@ -27,8 +27,9 @@ import torch
 from torch import Tensor
 
 from bcppl.arguments import latent_address, whole_number
-from bcppl.inference.kernels import Kernel, fitted, halved, halves, moved_by
-from bcppl.inference.kernels.kernel import refuse_no_kernel, scattered
+from bcppl.inference.kernels import Kernel, fitted, moved_by
+from bcppl.inference.kernels.halving import together
+from bcppl.inference.kernels.kernel import learns, refuse_no_kernel, scattered
 from bcppl.inference.population import Population, refuse_no_population
 from bcppl.inference.progress import watched
 from bcppl.inference.resampling import Scheme, systematic
@@ -72,10 +73,10 @@ def markov_chains(
 ) -> Chains:
     """Run a chain from each particle.
 
-    The kernel is fitted once, for each half of the chains to the starts of the other half, split by ancestry
-    (`bcppl.inference.kernels.halving`), and then stays:
-    the target is left invariant however long the chains are. From starts that are all at one value (a single
-    chain, or a mode) it learns no scale, and takes that of the prior (`bcppl.inference.proposals.spread_of`);
+    The kernel is fitted once and then stays; one that learns, for each half of the chains, to the starts of
+    the other half, split by ancestry (`bcppl.inference.kernels.halving`). So the target is left invariant
+    however long the chains are. From starts that are all at one value (a single chain, or a mode) it learns
+    no scale, and takes that of the prior (`bcppl.inference.proposals.spread_of`);
     where the prior is much wider than the target, `warm_up` adapts several chains.
 
     Args:
@@ -112,8 +113,7 @@ def markov_chains(
     recorded = list(trace.choices if addresses is None else addresses)
     for address in recorded:
         latent_address("chains are to record {}", address, trace.choices)
-    population = halved(population)
-    parts = halves(population)
+    population, parts = together(population, learning=learns(kernel))
     moves_of = [fitted(kernel, population[other]) for other in parts[::-1]]
     taken = torch.zeros(count, dtype=torch.float64)
     draws: dict[str, list[Tensor]] = {address: [] for address in recorded}

@@ -44,8 +44,7 @@ from bcppl.inference.filters.step import (
 )
 from bcppl.inference.filters.tempering import Rejuvenated, resample_move, tempered
 from bcppl.inference.filters.view_search import is_refuted, searched_by_climbing
-from bcppl.inference.kernels import Kernel, metropolis_hastings, sequence, surrogate_transition
-from bcppl.inference.kernels.kernel import Move
+from bcppl.inference.kernels import Kernel, composed, metropolis_hastings, sequence, surrogate_transition
 from bcppl.inference.kernels.rejuvenation import Moved, Until, moved_by, until
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import drift, prior
@@ -107,7 +106,7 @@ def kernel(pose: str, proposals: Callable[[Any], Sequence[Program]], *, screen: 
     once about where they have led.
     """
 
-    def move_of(population: Population) -> Move:
+    def drawn(population: Population) -> Kernel:
         walking = continuous_addresses(population.trace)
         others = [address for address in population.trace.choices if address != pose]
         walks = [metropolis_hastings(drift(a, WALK) if a in walking else prior(a)) for a in others]
@@ -117,9 +116,9 @@ def kernel(pose: str, proposals: Callable[[Any], Sequence[Program]], *, screen: 
         if screen and runs_physics(population.trace):
             # There and back: an order that all particles share is reversible only so.
             guided = [surrogate_transition(sequence([*guided, *reversed(guided[:-1])]), approximated)]
-        return sequence([*_one_of(walks), *guided])(population)
+        return sequence([*_one_of(walks), *guided])
 
-    return move_of
+    return composed(drawn)
 
 
 def _one_of(kernels: Sequence[Kernel]) -> list[Kernel]:

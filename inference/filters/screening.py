@@ -21,6 +21,7 @@ from torch import Tensor
 
 from bcppl.inference.filters.smcp3 import Pair, move_and_weight
 from bcppl.inference.filters.step import Assimilated, Observed
+from bcppl.inference.kernels.kernel import marked
 from bcppl.inference.kernels.rejuvenation import Moved
 from bcppl.inference.kernels.staged import SurrogateTarget
 from bcppl.inference.population import Population
@@ -37,6 +38,9 @@ def approximated(population: Population) -> Callable[[Trace], Tensor]:
     """A surrogate of the log-density of a trace: what is approximated takes the place of physics."""
     approximation = population.approximation
     return lambda trace: _cheap_log_density(trace, approximation)
+
+
+marked(approximated, learns=False)
 
 
 def screened(

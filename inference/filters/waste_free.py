@@ -13,7 +13,7 @@ from bcppl.arguments import number_within, whole_number
 from bcppl.errors import InputError
 from bcppl.inference.filters.tempering import Rejuvenated, Rejuvenation
 from bcppl.inference.kernels import Kernel, fitted, halved, halves
-from bcppl.inference.kernels.kernel import refuse_no_kernel, scattered
+from bcppl.inference.kernels.kernel import learns, refuse_no_kernel, scattered
 from bcppl.inference.kernels.rejuvenation import of_program
 from bcppl.inference.population import Population, log_pair
 from bcppl.inference.resampling import Scheme, systematic
@@ -25,10 +25,11 @@ def waste_free_moves(
 ) -> Rejuvenation:
     """A rejuvenation for `tempered`: M of N particles are resampled, and N / M - 1 moves made of each.
 
-    A move is fitted to the weighted particles of the other half (`bcppl.inference.kernels.halving`), before
-    resampling, and stays the same along a chain. A chain has to be much longer than the time in which it
-    forgets its start: with five states of a random walk in six correlated axes log Z came out 0.6 nats too
-    low, and variances 6 % too large (N = 1000, `benchmarks/exact.py`).
+    A move that learns is fitted to the weighted particles of the other half
+    (`bcppl.inference.kernels.halving`), before resampling, and stays the same along a chain. A chain has to
+    be much longer than the time in which it forgets its start: with five states of a random walk in six
+    correlated axes log Z came out 0.6 nats too low, and variances 6 % too large (N = 1000,
+    `benchmarks/exact.py`).
 
     Args:
         kernel: moves the particles; one that mixes well matters more than here the number of chains.
@@ -54,11 +55,15 @@ def waste_free_moves(
         if threshold < 1.0 and population.effective_sample_size >= threshold * count:
             return Rejuvenated(population, None, None)
         ancestors = scheme(population.log_weights, chains)
-        population = halved(population)
-        started = population[ancestors]
-        parts = halves(started)
-        others = [population.sides != started.sides[part[0]] for part in parts]
-        moves = [fitted(kernel, population[o] if bool(o.any()) else of_program(population)) for o in others]
+        if learns(kernel):
+            population = halved(population)
+            started = population[ancestors]
+            parts = halves(started)
+            others = [population.sides != started.sides[part[0]] for part in parts]
+            apart = [population[other] if bool(other.any()) else of_program(population) for other in others]
+        else:
+            started, parts, apart = population[ancestors], [torch.arange(chains)], [population]
+        moves = [fitted(kernel, each) for each in apart]
         current, acceptances = started.trace, []
         kept = population[ancestors.repeat(count // chains)]
         whole = kept.trace

@@ -19,7 +19,7 @@ A kernel is fitted to a population; its moves then leave any target invariant. K
 `sequence`, `cycle`, `mixture` and `repeat`.
 """
 
-from bcppl.inference.kernels.combinators import cycle, mixture, repeat, sequence
+from bcppl.inference.kernels.combinators import composed, cycle, mixture, repeat, sequence
 from bcppl.inference.kernels.halving import halved, halves
 from bcppl.inference.kernels.hamiltonian import hmc
 from bcppl.inference.kernels.hastings import metropolis_hastings
@@ -38,6 +38,7 @@ __all__ = [
     "Move",
     "Surrogate",
     "Until",
+    "composed",
     "cycle",
     "delayed_acceptance",
     "displacement",

@@ -7,7 +7,8 @@ proposals. All raise InputError where no kernel is given, or something else, suc
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from itertools import groupby
 from typing import Any
 
 import torch
@@ -20,6 +21,7 @@ from bcppl.inference.kernels.kernel import (
     Move,
     fitted,
     is_reversible,
+    learns,
     marked,
     refuse_no_kernel,
     scattered,
@@ -46,7 +48,8 @@ def _one_after_another(kernels: Sequence[Kernel]) -> Kernel:
 
         return move
 
-    return marked(together, reversible=kernels == kernels[::-1] and all(map(is_reversible, kernels)))
+    reversible = kernels == kernels[::-1] and all(map(is_reversible, kernels))
+    return marked(together, reversible=reversible, learns=any(map(learns, kernels)))
 
 
 def _listed(name: str, kernels: Sequence[Kernel | Sequence[Kernel]]) -> list[Kernel]:
@@ -62,7 +65,40 @@ def _listed(name: str, kernels: Sequence[Kernel | Sequence[Kernel]]) -> list[Ker
 
 def sequence(*kernels: Kernel | Sequence[Kernel]) -> Kernel:
     """One kernel after another, in the order given, one by one or as a list."""
-    return _one_after_another(_listed("sequence", kernels))
+    listed = _listed("sequence", kernels)
+    together = _one_after_another(listed)
+    vars(together)["parts"] = listed
+    return together
+
+
+def composed(of: Callable[[Population], Kernel]) -> Kernel:
+    """A kernel that is put together for each sweep: `of(population)` gives it.
+
+    What is put together may depend on which sites the trace has and on the approximation that the population
+    carries, and be drawn at random; not on where the particles are.
+    """
+
+    def kernel(population: Population) -> Move:
+        return fitted(of(population), population)
+
+    vars(kernel)["of"] = of
+    return kernel
+
+
+def in_parts(kernel: Kernel, population: Population) -> list[tuple[Kernel, int]]:
+    """Kernels whose moves follow one another, for a population: learners apart from others.
+
+    Each comes with how many moves it is made of.
+    """
+    groups = [list(group) for _, group in groupby(_flat(kernel, population), key=learns)]
+    return [(each[0] if len(each) == 1 else _one_after_another(each), len(each)) for each in groups]
+
+
+def _flat(kernel: Kernel, population: Population) -> list[Kernel]:
+    of, parts = getattr(kernel, "of", None), getattr(kernel, "parts", None)
+    if of is not None:
+        return _flat(of(population), population)
+    return [kernel] if parts is None else [each for part in parts for each in _flat(part, population)]
 
 
 def cycle(*kernels: Kernel | Sequence[Kernel]) -> Kernel:
@@ -86,7 +122,11 @@ def cycle(*kernels: Kernel | Sequence[Kernel]) -> Kernel:
 
         return move
 
-    return marked(together, reversible=all(map(is_reversible, listed)))
+    return _of_all(together, listed)
+
+
+def _of_all(kernel: Kernel, listed: Sequence[Kernel]) -> Kernel:
+    return marked(kernel, reversible=all(map(is_reversible, listed)), learns=any(map(learns, listed)))
 
 
 def mixture(*kernels: Kernel | Sequence[Kernel], weights: Sequence[float] | None = None) -> Kernel:
@@ -121,7 +161,7 @@ def mixture(*kernels: Kernel | Sequence[Kernel], weights: Sequence[float] | None
 
         return move
 
-    return marked(together, reversible=all(map(is_reversible, listed)))
+    return _of_all(together, listed)
 
 
 def _each_by_its_own(

@@ -35,6 +35,17 @@ def halves(population: Population) -> list[Tensor]:
     return [part for part in parts if len(part)]
 
 
+def together(population: Population, *, learning: bool) -> tuple[Population, list[Tensor]]:
+    """A population, and the indices (K,) of the particles that are moved together.
+
+    They are its halves where moves learn from particles, for which it is split, and else all.
+    """
+    if not learning:
+        return population, [torch.arange(len(population))]
+    population = halved(population)
+    return population, halves(population)
+
+
 def _copies(population: Population) -> Tensor:
     """The number (N,) of each particle's group of copies: those with equal continuous values.
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from bcppl.errors import InputError
 from bcppl.inference.kernels.kernel import Kernel, Move, decided, marked, refuse_observed
 from bcppl.inference.population import Population
-from bcppl.inference.proposals.proposal import Proposal, program_of
+from bcppl.inference.proposals.proposal import Fittable, Proposal, program_of
 from bcppl.inference.targets import Target, visible
 from bcppl.traces import Trace, assess, propose, update
 from bcppl.traces.indexing import broadcast
@@ -66,4 +66,4 @@ def metropolis_hastings(proposal: Proposal, *learned: Callable[[Population], Any
 
         return move
 
-    return marked(kernel)
+    return marked(kernel, learns=isinstance(proposal, Fittable) or bool(learned))

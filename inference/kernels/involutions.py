@@ -20,7 +20,7 @@ from bcppl.inference.kernels.jacobian import (
 )
 from bcppl.inference.kernels.kernel import Kernel, Move, decided, marked, refuse_observed
 from bcppl.inference.population import Population
-from bcppl.inference.proposals.proposal import Proposal, program_of
+from bcppl.inference.proposals.proposal import Fittable, Proposal, program_of
 from bcppl.inference.targets import Target, visible
 from bcppl.traces import Trace, assess, simulate, update
 from bcppl.traces.values import Values
@@ -92,7 +92,7 @@ def involutive(program: Proposal, involution: Involution, *, check: bool = False
 
         return move
 
-    return marked(kernel)
+    return marked(kernel, learns=isinstance(program, Fittable))
 
 
 def _mapped(involution: Involution, point: Mapping[Key, Tensor]) -> dict[Key, Tensor]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -22,6 +22,7 @@ from bcppl.inference.proposals.proposal import Fittable
 from bcppl.inference.targets import Target, accept
 from bcppl.traces import Trace
 
+Function = TypeVar("Function", bound=Callable[..., Any])
 Move = Callable[[Trace, Target], tuple[Trace, Tensor]]
 Kernel = Callable[[Population], Move]
 
@@ -50,9 +51,19 @@ def is_reversible(kernel: Kernel) -> bool:
     return bool(getattr(kernel, "reversible", False))
 
 
-def marked(kernel: Kernel, *, reversible: bool = True) -> Kernel:
-    """The kernel, with a mark that `is_reversible` reads."""
-    vars(kernel)["reversible"] = reversible
+def learns(kernel: Callable[..., Any]) -> bool:
+    """Whether a kernel's moves depend on where the particles are that it is fitted to.
+
+    Those of a proposal that learns (`Fittable`) and of `hmc` do, those of a program do not, and a kernel of
+    one's own is taken to, unless it is `marked` otherwise. Moves that do not need no other particles: the
+    whole population makes them at once.
+    """
+    return bool(getattr(kernel, "learns", True))
+
+
+def marked(kernel: Function, *, reversible: bool = True, learns: bool = True) -> Function:
+    """The kernel, with marks that `is_reversible` and `learns` read."""
+    vars(kernel).update(reversible=reversible, learns=learns)
     return kernel
 
 

@@ -1,4 +1,4 @@
-"""Rejuvenation: every particle of a population is moved by a kernel that is fitted to the other half."""
+"""Rejuvenation: every particle of a population is moved, by a kernel that learns from other particles."""
 
 from __future__ import annotations
 
@@ -16,8 +16,9 @@ from bcppl.beliefs import normalised
 from bcppl.devices import on_device_of
 from bcppl.distributions.support import freedom_of
 from bcppl.errors import InputError
+from bcppl.inference.kernels.combinators import in_parts
 from bcppl.inference.kernels.halving import halved, halves
-from bcppl.inference.kernels.kernel import Kernel, fitted, scattered
+from bcppl.inference.kernels.kernel import Kernel, fitted, learns, scattered
 from bcppl.inference.population import Population
 from bcppl.inference.proposals.spread import program_draws
 from bcppl.inference.targets import Target
@@ -133,13 +134,14 @@ def _coordinates(start: Population, now: Population, address: str) -> tuple[Tens
 def moved_by(population: Population, kernel: Kernel, target: Target, sweeps: int | Until = 1) -> Moved:
     """Move every particle, `sweeps` times.
 
-    The kernel that moves one half of the population is fitted to the other, so that no particle shapes its
-    own proposal, nor do its copies (`bcppl.inference.kernels.halving`). Where there is one particle, or all
-    are copies of one, it is fitted to draws of the program.
+    A kernel that learns and moves one half of the population is fitted to the other, so that no particle
+    shapes its own proposal, nor do its copies (`bcppl.inference.kernels.halving`). Where there is one
+    particle, or all are copies of one, it is fitted to draws of the program. One that learns nothing moves
+    all at once, which for few particles takes half as long; so do the parts of a `sequence`.
 
     Args:
         population: of N particles.
-        kernel: fitted to each half, in each sweep.
+        kernel: fitted in each sweep.
         target: left invariant by the moves.
         sweeps: how many; 0 leaves the population as it is. Or `until(...)`.
 
@@ -165,16 +167,28 @@ def of_program(population: Population) -> Population:
 
 
 def _sweep(population: Population, kernel: Kernel, target: Target) -> tuple[Population, Tensor]:
-    population = halved(population)
     if isinstance(target, Target):
         # What is known of all particles is known of each half, and stays known of those that do not move.
         target(population.trace)
-    parts, shares = halves(population), []
+    total, count = torch.zeros(len(population), dtype=torch.float64), 0
+    for part, moves in in_parts(kernel, population):
+        population, share = (_by_halves if learns(part) else _all_at_once)(population, part, target)
+        total, count = total + moves * share, count + moves
+    return population, total / count
+
+
+def _all_at_once(population: Population, kernel: Kernel, target: Target) -> tuple[Population, Tensor]:
+    moved, share = fitted(kernel, population)(population.trace, target)
+    return population.with_trace(moved), share.to(torch.float64)
+
+
+def _by_halves(population: Population, kernel: Kernel, target: Target) -> tuple[Population, Tensor]:
+    population = halved(population)
+    parts, shares = halves(population), torch.zeros(len(population), dtype=torch.float64)
     for mine, others in zip(parts, parts[::-1], strict=True):
         # Fitted to those that are moved it would not leave the target invariant, where no other is apart.
         apart = population[others] if len(parts) > 1 else of_program(population)
-        move = fitted(kernel, apart)
-        moved, share = move(population.trace[mine], target)
-        shares.append(share.to(torch.float64))
+        moved, share = fitted(kernel, apart)(population.trace[mine], target)
+        shares[mine] = share.to(torch.float64)
         population = population.with_trace(scattered(population.trace, mine, moved))
-    return population, torch.cat(shares)
+    return population, shares

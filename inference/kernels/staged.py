@@ -17,7 +17,16 @@ from torch import Tensor
 
 from bcppl.arguments import number_within, whole_number
 from bcppl.errors import InputError
-from bcppl.inference.kernels.kernel import Kernel, Move, fitted, is_reversible, refuse_no_kernel, scattered
+from bcppl.inference.kernels.kernel import (
+    Kernel,
+    Move,
+    fitted,
+    is_reversible,
+    learns,
+    marked,
+    refuse_no_kernel,
+    scattered,
+)
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import spread_of
 from bcppl.inference.proposals.coordinates import coordinates_of
@@ -201,7 +210,9 @@ def delayed_acceptance(
 
         return in_stages
 
-    return staged
+    return marked(
+        staged, reversible=False, learns=learns(kernel) or (surrogate is not None and learns(surrogate))
+    )
 
 
 def surrogate_transition(kernel: Kernel, surrogate: Surrogate) -> Kernel:
@@ -249,7 +260,7 @@ def surrogate_transition(kernel: Kernel, surrogate: Surrogate) -> Kernel:
 
         return transition
 
-    return fit
+    return marked(fit, reversible=False, learns=learns(kernel) or learns(surrogate))
 
 
 def _displaced(old: Trace, new: Trace) -> Tensor:

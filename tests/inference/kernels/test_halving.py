@@ -16,7 +16,15 @@ from torch import Tensor
 from bcppl.inference import Population, markov_chains, replicate, resample, resize
 from bcppl.inference.filters.smcp3 import Pair, move_and_weight
 from bcppl.inference.filters.waste_free import waste_free_moves
-from bcppl.inference.kernels import Kernel, halved, halves, metropolis_hastings, moved_by
+from bcppl.inference.kernels import (
+    Kernel,
+    composed,
+    halved,
+    halves,
+    metropolis_hastings,
+    moved_by,
+    sequence,
+)
 from bcppl.inference.proposals import Fittable, drift, independent
 from bcppl.inference.resampling import systematic
 from bcppl.inference.targets import POSTERIOR
@@ -224,3 +232,45 @@ def test_equal_discrete_values_are_no_copies() -> None:
         changes.append((moved_coins - population["coin"]).double().mean())
     change = torch.stack(changes)
     assert abs(float(change.mean() / (change.std() / math.sqrt(len(change))))) < 3.5
+
+
+def test_what_learns_nothing_moves_all_at_once_also_beside_what_learns() -> None:
+    """In a sequence learners move halves, others all; particles keep their places, the law its shape."""
+    calls: list[int] = []
+
+    def fresh(trace: Trace) -> None:
+        calls.append(len(trace))
+        pyro.sample("x", dist.Normal(torch.zeros(len(trace)).double(), 2.0))
+
+    def fitted_to(population: Population) -> Callable[[Trace], None]:
+        scale = float(population["x"].std(correction=0))
+
+        def walk(trace: Trace) -> None:
+            calls.append(len(trace))
+            pyro.sample("x", dist.Normal(trace["x"], 0.5 + scale))
+
+        return walk
+
+    def program() -> None:
+        pyro.sample("tag", dist.Normal(torch.tensor(0.0).double(), 1.0))
+        pyro.sample("x", dist.Normal(torch.tensor(0.0).double(), 1.0))
+
+    drawn: list[int] = []
+
+    def of(population: Population) -> Kernel:
+        drawn.append(len(population))
+        independent, walk = metropolis_hastings(fresh), metropolis_hastings(Fittable(fitted_to))
+        return sequence(sequence(independent, walk), independent)
+
+    torch.manual_seed(0)
+    start = Population(simulate(program, (), 4000))
+    done = moved_by(start, composed(of), POSTERIOR, 2)
+    there_and_back = [4000, 4000]
+    both_halves = [int(done.population.sides.sum())] * 2 + [int((~done.population.sides).sum())] * 2
+    assert drawn == [4000, 4000]
+    assert calls == [*there_and_back, *both_halves, *there_and_back] * 2
+    assert torch.equal(done.population["tag"], start["tag"])
+    x = done.population["x"]
+    assert abs(float(x.mean())) < 4.5 / math.sqrt(4000)
+    assert abs(float(x.var()) - 1.0) < 4.5 * math.sqrt(2.0 / 4000)
+    assert 0.3 < done.acceptance < 0.8
