@@ -5,7 +5,8 @@
     {"ask": "samples", "wrench": (K, 7), "pose": (L, 8)}    rows of a stamp and what was measured then
     {"ask": "end"}                     the probe is over
     {"ask": "view", "camera": {...}, "depth": (H, W)}       a depth image, m
-    {"ask": "belief"}                  {"mean": (7,), "covariance": (6, 6), "effective", "behind", ...}
+    {"ask": "belief"}                  {"mean": (7,), "covariance": (6, 6), "effective", "behind", ...},
+                                       and sentences on what was "left_out" last
     {"ask": "next_probe"}              {"plan": {...}, "gain": nats}
     {"ask": "insertion"}               {"search": {...}, "push": {...}}; of several holes the one around
                                        a point "inside" (x, y), m in the part's frame
@@ -40,6 +41,7 @@ from bcppl.sensors.protocol import Plannable, sensor_named
 MOST_STAMPS = 100_000  # of a probe
 WAITS = 60.0  # s for a ranking or a plan
 LATEST = 2.0**32  # s: beyond it a float cannot tell stamps a microsecond apart
+LISTED = 10  # measurements that were left out
 LOG = logging.getLogger(__name__)
 
 Answer = dict[str, Any]
@@ -157,6 +159,7 @@ class Session:
             "effective": belief.effective_sample_size,
             "measurements": step.taken,
             "behind": self.live.behind,
+            "left_out": [each.fault for each in self.live.updates if each.fault][-LISTED:],
         }
 
     def _next_probe(self, _: Mapping[str, Any]) -> Answer:

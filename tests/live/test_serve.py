@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
 
-from bcppl.errors import InputError
+from bcppl.errors import InferenceError, InputError
 from bcppl.inference import guided_smc
 from bcppl.inference.live import Filter, server, wire
 from bcppl.inference.live.client import Client
@@ -182,7 +182,24 @@ def test_samples_that_are_sent_give_the_belief_of_their_windows(session: Session
     # Other windows are other steps: the same rows and evidence, other random numbers.
     deviation = expected.covariance[:3, :3].diagonal().sqrt().numpy()
     assert (np.abs(got["mean"][:3] - expected.mean[:3].numpy()) < 3.0 * deviation).all()
-    assert got["behind"] == 0 and got["covariance"].shape == (6, 6)
+    assert got["behind"] == 0 and got["covariance"].shape == (6, 6) and got["left_out"] == []
+
+
+@pytest.mark.filterwarnings("ignore:no particle explains it")
+def test_a_client_learns_what_was_left_out(touched: Recording) -> None:
+    def inexplicable(*given: Any, start: Any = None, **settings: Any) -> Iterator[Any]:
+        if start is not None:
+            raise InferenceError("no particle explains it")
+        yield from guided_smc.infer(*given, **settings)
+
+    first = touched.measurements[0]
+    empty = replace(touched, measurements=[])
+    with Filter(model, empty, particles=20, infer=inexplicable) as live, serving(Session(live)) as served:
+        live.observe(first.action, first.observation)
+        live.settle()
+        with Client(*served.address, "secret") as client:
+            answer = client.ask("belief")
+    assert answer["left_out"] == ["no particle explains it"] and answer["measurements"] == 0
 
 
 @pytest.mark.parametrize(
