@@ -12,8 +12,10 @@ import ast
 import sys
 from collections.abc import Callable
 from importlib import import_module
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec
 from importlib.resources import files
-from importlib.util import find_spec, module_from_spec
+from importlib.util import find_spec, module_from_spec, spec_from_loader
 from types import ModuleType
 from typing import Any
 
@@ -41,6 +43,35 @@ class _WhenUsed(ModuleType):
     def __reduce__(self) -> tuple[Callable[[str], ModuleType], tuple[str]]:
         """As cloudpickle sends a module to another process, which knows this class as no module."""
         return import_module, (self.__name__,)
+
+
+class _Loaded(Loader):
+    """Gives a module that was executed already."""
+
+    def __init__(self, module: ModuleType) -> None:
+        self.module, self.spec = module, module.__spec__
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType:
+        return self.module
+
+    def exec_module(self, module: ModuleType) -> None:
+        module.__spec__ = self.spec
+
+
+class _OnceOnly(MetaPathFinder):
+    """Finds a submodule that its package has imported while it was asked where to look for it.
+
+    The import of a submodule asks for the package's `__path__`, which executes a package that has not been
+    used. What that imports would be executed once more, and its classes and kernels be others than those
+    that the package has.
+    """
+
+    def find_spec(self, name: str, path: Any = None, target: ModuleType | None = None) -> ModuleSpec | None:
+        module = sys.modules.get(name) if name.startswith(f"{__package__}.") and target is None else None
+        return None if module is None else spec_from_loader(name, _Loaded(module))
+
+
+sys.meta_path.insert(0, _OnceOnly())
 
 
 def _when_used(name: str) -> ModuleType:

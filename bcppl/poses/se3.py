@@ -265,3 +265,16 @@ class Freedom:
 
 
 FREE = Freedom()
+
+
+def right_jacobian(turn: Tensor) -> Tensor:
+    """The right Jacobian (..., 3, 3) of SO(3) at rotation vectors (..., 3): Exp(w + d) = Exp(w) Exp(J d).
+
+    Chirikjian, Stochastic Models, Information Theory, and Lie Groups, vol. 2, 10.86.
+    """
+    angle = turn.norm(dim=-1)[..., None, None].clamp(min=1e-6)
+    x, y, z = turn.unbind(dim=-1)
+    zero = torch.zeros_like(x)
+    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).reshape(*turn.shape, 3)
+    first, second = (1.0 - angle.cos()) / angle**2, (angle - angle.sin()) / angle**3
+    return torch.eye(3, dtype=torch.float64) - first * cross + second * (cross @ cross)

@@ -42,8 +42,8 @@ from bcppl.inference.design.ranking import (
     rank,
     warn_of_failures,
 )
-from bcppl.inference.design.relative_mixture import HeldPeg, PoseMixture, RelativeMixture
-from bcppl.inference.design.tangent_mixture import TangentMixture, entropy_reduction
+from bcppl.inference.design.relative_mixture import HeldPeg, RelativeMixture, entropy_reduction
+from bcppl.inference.design.tangent_mixture import TangentMixture
 from bcppl.inference.population import Population
 from bcppl.inference.resampling import seeded
 from bcppl.traces import Trace
@@ -119,7 +119,7 @@ def linearised_information_gain(
         outer = draw_outer_samples(population, outer_samples)
     address = next(iter(population.trace.choices)) if address is None else address
     belief = TangentMixture.fit(population, address, translation, rotation)
-    interest: PoseMixture = belief
+    interest = RelativeMixture.alone(belief)
     if peg is not None and peg.errors.errors:
         interest = RelativeMixture.fit(population, address, belief, peg)
     trace = population.trace.chosen(outer.particles)
@@ -137,7 +137,7 @@ def linearised_information_gain(
             raise InferenceError(f"the simulation of candidate {k} failed under every outer sample.")
         warn_of_failures(k, torch.isnan(gains))
         if len(belief) > 1 and observations.sites:
-            after = _posterior_entropies(belief, interest, observations, trace, address, mode, drawn, gains)
+            after = _posterior_entropies(interest, observations, trace, address, mode, drawn, gains)
             gains = interest.entropy - after
         elif len(belief) > 1:
             uncounted.append(k)
@@ -157,8 +157,7 @@ def linearised_information_gain(
 
 
 def _posterior_entropies(
-    belief: TangentMixture,
-    interest: PoseMixture,
+    interest: RelativeMixture,
     predicted: PredictedObservations,
     trace: Trace,
     address: str,
@@ -172,13 +171,14 @@ def _posterior_entropies(
     their product over the pose and the shared errors, and the volume around it. The true errors are those of
     the outer sample's mode, given its pose, at standard normal numbers (S, M) that are `drawn`.
     """
+    belief = interest.pose
     white = torch.cat([belief.white_coordinates(trace[address], mode), drawn], dim=1)
     measured = predicted.with_shared_errors(_errors(interest, white, mode))
     log_evidence, reductions = [], []
     for k in range(len(belief)):
         modes, own = torch.full_like(mode, k), (mode == k)[:, None]
         start = torch.where(own, trace[address], belief.mean[k]), torch.where(own, drawn, 0.0)
-        at, white = _maximum(belief, interest, measured, trace, address, modes, start)
+        at, white = _maximum(interest, measured, trace, address, modes, start)
         sites, errors = measured.at(trace.at({address: at})), _errors(interest, white, modes)
         information = interest.whiten(sum_quadratics(sites, errors).information, at, modes)
         volume = entropy_reduction(information)
@@ -189,15 +189,14 @@ def _posterior_entropies(
     return (torch.special.entr(shares) + shares * entropies).sum(dim=0)
 
 
-def _errors(interest: PoseMixture, white: Tensor, mode: Tensor) -> Tensor:
+def _errors(interest: RelativeMixture, white: Tensor, mode: Tensor) -> Tensor:
     """Shared errors (S, M) at whitened coordinates (S, d + M) of modes (S,)."""
     lower = interest.factor[mode][:, interest.factor.shape[1] - interest.shared :]
     return interest.errors[mode] + (lower @ white[..., None])[..., 0]
 
 
 def _maximum(
-    belief: TangentMixture,
-    interest: PoseMixture,
+    interest: RelativeMixture,
     predicted: PredictedObservations,
     trace: Trace,
     address: str,
@@ -209,6 +208,7 @@ def _maximum(
     From poses and whitened errors (S, M) to start at; the coordinates (S, d + M) are of both.
     """
     at, left = start
+    belief = interest.pose
     d = belief.freedom.dimension
     eye = torch.eye(d + interest.shared, dtype=torch.float64)
     axes = [*belief.freedom.axes, *range(6, 6 + interest.shared)]

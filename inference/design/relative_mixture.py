@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -40,45 +40,26 @@ class HeldPeg(NamedTuple):
     prior: tuple[Tensor, Tensor] | None = None
 
 
-class PoseMixture(Protocol):
-    """Gaussians of a belief's modes over a pose in the world (`TangentMixture`) or relative to a peg."""
-
-    @property
-    def shared(self) -> int:
-        """M, how many parameters an information matrix has besides the six of the pose."""
-
-    @property
-    def factor(self) -> Tensor:
-        """(K, d + M, d + M) L of the covariance L L' of pose and parameters, 0 in rows d by the last M."""
-
-    @property
-    def errors(self) -> Tensor:
-        """(K, M) means of the parameters."""
-
-    @property
-    def entropy(self) -> float:
-        """Nats of the mixture: exact where modes do not overlap."""
-
-    @property
-    def entropies(self) -> Tensor:
-        """(K,) nats of each Gaussian with respect to the base measure."""
-
-    def whiten(self, information: Tensor, world_from_part: Tensor, mode: Tensor) -> Tensor:
-        """Information matrices (S, 6 + M, 6 + M) at poses (S, 7), in the whitened axes of modes (S,)."""
-
-    def reduction(self, white: Tensor, mode: Tensor) -> Tensor:
-        """Entropy reductions (S,) by whitened information, nats; NaN where it is not finite."""
-
-
 @dataclass(frozen=True, eq=False)
 class RelativeMixture:
-    """A Gaussian for each of K modes over the pose relative to a held peg, and the errors that it shares."""
+    """A Gaussian for each of K modes over the pose relative to a held peg, and the errors that it shares.
+
+    Of a pose in the world, where touches share no errors, M is 0.
+    """
 
     pose: TangentMixture
     factor: Tensor  # (K, d + M, d + M) L of the covariance L L' of pose and shared errors
     errors: Tensor  # (K, M) means of the shared errors
     standard: Tensor  # (K, d, d + M) the relative pose in its own standard axes, by those of the factor
     log_volume: Tensor  # (K,) log of the product of its standard deviations
+
+    @classmethod
+    def alone(cls, pose: TangentMixture) -> RelativeMixture:
+        """That of the pose in the world, without errors."""
+        modes, d = pose.factor.shape[:2]
+        standard = torch.eye(d, dtype=torch.float64).expand(modes, d, d)
+        log_volume = pose.factor.diagonal(dim1=-2, dim2=-1).log().sum(dim=-1)
+        return cls(pose, pose.factor, pose.factor.new_zeros(modes, 0), standard, log_volume)
 
     @classmethod
     def fit(cls, population: Population, address: str, pose: TangentMixture, peg: HeldPeg) -> RelativeMixture:
@@ -146,6 +127,17 @@ class RelativeMixture:
         standard = self.standard[mode]
         covariance = standard @ torch.linalg.solve(eye + known, standard.transpose(-1, -2))
         return torch.where(failed, torch.nan, -0.5 * torch.linalg.slogdet(covariance).logabsdet)
+
+
+def entropy_reduction(information: Tensor) -> Tensor:
+    """The entropy reduction (...) of a standard normal by information matrices (..., d, d), nats.
+
+    NaN where the information is not finite.
+    """
+    eye = torch.eye(information.shape[-1], dtype=torch.float64)
+    failed = ~torch.isfinite(information).all(dim=-1).all(dim=-1)
+    valid = torch.where(failed[..., None, None], 0.0, information)
+    return torch.where(failed, torch.nan, 0.5 * torch.linalg.slogdet(eye + valid).logabsdet)
 
 
 def _motion(pose: TangentMixture, mode: int, peg: HeldPeg) -> Tensor:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -61,65 +60,14 @@ class TangentMixture:
         factor = [cholesky_factor(address, c + floor / n) for c, n in zip(covariance, sizes, strict=True)]
         return cls(freedom, label, torch.stack(means), mass, torch.stack(factor), torch.stack(bases))
 
-    @property
-    def entropies(self) -> Tensor:
-        """(K,) nats of each Gaussian with respect to the base measure."""
-        log_volume = self.factor.diagonal(dim1=-2, dim2=-1).log().sum(dim=-1)
-        return 0.5 * self.freedom.dimension * math.log(2.0 * math.pi * math.e) + log_volume + self.log_base
-
-    @property
-    def entropy(self) -> float:
-        """Nats of the mixture: exact where modes do not overlap."""
-        return float(torch.special.entr(self.mass).sum() + self.mass @ self.entropies)
-
-    shared = 0  # parameters that information matrices have besides the pose's
-
-    @property
-    def errors(self) -> Tensor:
-        """(K, 0) the means of those."""
-        return self.factor.new_zeros(len(self), 0)
-
-    def whiten(self, information: Tensor, world_from_part: Tensor, mode: Tensor) -> Tensor:
-        """Information matrices (S, 6, 6) at poses (S, 7), as (S, d, d) in the whitened axes of modes (S,)."""
-        white = self.tangent_of(world_from_part, mode) @ self.factor[mode]
-        return white.transpose(-1, -2) @ information @ white
-
-    def reduction(self, white: Tensor, mode: Tensor) -> Tensor:
-        """Entropy reductions (S,) by whitened information, nats; NaN where it is not finite."""
-        return entropy_reduction(white)
-
     def tangent_of(self, world_from_part: Tensor, mode: Tensor) -> Tensor:
         """Derivatives (S, 6, d) in the tangent space at poses (S, 7), by free coordinates at modes' means."""
         turn = poses.local(self.mean[mode], world_from_part)[:, 3:]
         jacobian = torch.eye(6, dtype=torch.float64).repeat(len(turn), 1, 1)
-        jacobian[:, 3:, 3:] = right_jacobian(turn)
+        jacobian[:, 3:, 3:] = poses.right_jacobian(turn)
         return jacobian[:, :, list(self.freedom.axes)]
 
     def white_coordinates(self, world_from_part: Tensor, mode: Tensor) -> Tensor:
         """The whitened tangent coordinates (S, d) of poses (S, 7) at the means of modes (S,)."""
         away = self.freedom.coordinates(poses.local(self.mean[mode], world_from_part))
         return torch.linalg.solve_triangular(self.factor[mode], away[..., None], upper=False)[..., 0]
-
-
-def entropy_reduction(information: Tensor) -> Tensor:
-    """The entropy reduction (...) of a standard normal by information matrices (..., d, d), nats.
-
-    NaN where the information is not finite.
-    """
-    eye = torch.eye(information.shape[-1], dtype=torch.float64)
-    failed = ~torch.isfinite(information).all(dim=-1).all(dim=-1)
-    valid = torch.where(failed[..., None, None], 0.0, information)
-    return torch.where(failed, torch.nan, 0.5 * torch.linalg.slogdet(eye + valid).logabsdet)
-
-
-def right_jacobian(turn: Tensor) -> Tensor:
-    """The right Jacobian (..., 3, 3) of SO(3) at rotation vectors (..., 3): Exp(w + d) = Exp(w) Exp(J d).
-
-    Chirikjian, Stochastic Models, Information Theory, and Lie Groups, vol. 2, 10.86.
-    """
-    angle = turn.norm(dim=-1)[..., None, None].clamp(min=1e-6)
-    x, y, z = turn.unbind(dim=-1)
-    zero = torch.zeros_like(x)
-    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).reshape(*turn.shape, 3)
-    first, second = (1.0 - angle.cos()) / angle**2, (angle - angle.sin()) / angle**3
-    return torch.eye(3, dtype=torch.float64) - first * cross + second * (cross @ cross)

@@ -167,9 +167,6 @@ def of_program(population: Population) -> Population:
 
 
 def _sweep(population: Population, kernel: Kernel, target: Target) -> tuple[Population, Tensor]:
-    if isinstance(target, Target):
-        # What is known of all particles is known of each half, and stays known of those that do not move.
-        target(population.trace)
     total, count = torch.zeros(len(population), dtype=torch.float64), 0
     for part, moves in in_parts(kernel, population):
         population, share = (_by_halves if learns(part) else _all_at_once)(population, part, target)
@@ -183,6 +180,9 @@ def _all_at_once(population: Population, kernel: Kernel, target: Target) -> tupl
 
 
 def _by_halves(population: Population, kernel: Kernel, target: Target) -> tuple[Population, Tensor]:
+    if isinstance(target, Target):
+        # What is known of all particles is known of each half, and stays known of those that do not move.
+        target(population.trace)
     population = halved(population)
     parts, shares = halves(population), torch.zeros(len(population), dtype=torch.float64)
     for mine, others in zip(parts, parts[::-1], strict=True):

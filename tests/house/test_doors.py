@@ -45,6 +45,20 @@ def test_describing_a_recording_imports_no_simulator_and_no_tensor_library() -> 
     assert modules.isdisjoint({"torch", "pyro", "scipy", "trimesh", "matplotlib", "mujoco", "numba"})
 
 
+@pytest.mark.parametrize("name", ["contact.quasi_static", "poses.kernels", "geometry.gap.peg_gap"])
+def test_no_module_is_executed_twice(name: str) -> None:
+    """A package that is executed when first used imports what its importer is about to."""
+    code = "from importlib.machinery import SourceFileLoader as Loader\n"
+    code += "executed, plain = [], Loader.exec_module\n"
+    code += "Loader.exec_module = lambda self, m: (executed.append(m.__name__), plain(self, m))[1]\n"
+    code += f"import bcppl.{name}\nfrom bcppl import poses\nassert poses.se3.kernels is poses.kernels\n"
+    code += "own = [each for each in executed if each.startswith('bcppl.')]\n"
+    code += "assert len(own) == len(set(own)), own\n"
+    code += "import bcppl.poses.kernels as kernels\n"
+    code += "assert type(kernels.__spec__.loader) is Loader and kernels is poses.kernels"
+    assert "bcppl.poses.kernels" in imported(code)
+
+
 @pytest.mark.long
 def test_checking_a_recording_imports_what_renders_and_measures_gaps_and_no_physics() -> None:
     modules = imported("from bcppl.cli import app\napp(['check', 'peg_probe'], standalone_mode=False)")

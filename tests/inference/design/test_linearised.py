@@ -19,7 +19,7 @@ from bcppl.errors import InputError
 from bcppl.geometry.extrusion import block, box_peg
 from bcppl.geometry.gap import PegGap
 from bcppl.inference.design import linearised_information_gain, mixture_entropy
-from bcppl.inference.design.tangent_mixture import TangentMixture, right_jacobian
+from bcppl.inference.design.tangent_mixture import TangentMixture
 from bcppl.inference.population import Population
 from bcppl.robot.motion import ProbeWindow
 from bcppl.robot.plan import Plan
@@ -45,7 +45,7 @@ class Read(LazyDistribution):
         return self.expected + self.noise * torch.randn(len(self.expected), dtype=torch.float64)
 
     def quadratic(self, value: Tensor) -> Quadratic:
-        turn = torch.linalg.inv(right_jacobian(poses.local(CENTER, self.pose)[:, 3:]))
+        turn = torch.linalg.inv(poses.right_jacobian(poses.local(CENTER, self.pose)[:, 3:]))
         rows = self.row.expand(len(self.pose), 6).clone()
         rows[:, 3:] = (rows[:, None, 3:] @ turn)[:, 0]
         pull = rows * ((self.expected - value) / self.noise**2)[:, None]
