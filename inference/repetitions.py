@@ -192,8 +192,10 @@ class Repeated:
 
         Raises:
             InputError: the runs are of a long series, whose traces depend on the steps before.
+            NoWeightError: no particle has any weight in any run.
         """
         _refuse_series(self.populations[0])
+        _ = self._alive
         # Simulators' states are left: pooled particles are read, and seldom moved.
         trace = concatenated([replace(p.trace, carried={}) for p in self.populations])
         before = np.cumsum([0, *(int(p.founders.max()) + 1 for p in self.populations)])

@@ -47,7 +47,7 @@ class KernelCheck(NamedTuple):
     """What a kernel did that passed.
 
     Attributes:
-        p_value: of the expectation that changed most, times the number of expectations, at most 1.
+        p_value: of the expectation that changed most, times the number of those that changed, at most 1.
         acceptance: the share of proposals that were accepted.
     """
 

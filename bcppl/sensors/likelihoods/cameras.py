@@ -80,7 +80,8 @@ class ClutteredCamera(CalibratedCamera):
         shift, turn: standard deviations of where an image sees the part, along and about each axis, metres
             and radians; a shift of 0 for images that see it where it is.
         bias: the same along the ray, metres, in addition.
-        noise: further arguments of `RobustDepth`.
+        scale: of a pixel's error, metres.
+        noise: further arguments of `RobustDepth`, of images with a background or without clutter.
     """
 
     nuisance_addresses = ("seen_by_*",)
@@ -96,11 +97,12 @@ class ClutteredCamera(CalibratedCamera):
         shift: float,
         turn: float,
         bias: float,
+        scale: float,
         **noise: Any,
     ) -> None:
-        super().__init__(recording, renderer, **noise)
+        super().__init__(recording, renderer, scale=scale, **noise)
         self.stride, self.temperature, self.clutter = stride, temperature, clutter
-        self.shift, self.turn, self.bias = shift, turn, bias
+        self.shift, self.turn, self.bias, self.scale = shift, turn, bias, scale
         self.error = InstrumentError(self._effect, math.sqrt(0.5))
         self.viewpoints = viewpoints_of(recording)
 
@@ -141,8 +143,8 @@ class ClutteredCamera(CalibratedCamera):
     def image(self, camera: Camera, part: Tensor) -> Any:
         """The likelihood of an image of a part that is seen at poses (N, 7)."""
         if self.clutter and self.background.get(camera.name) is None:
-            scale, stride, temperature = self.noise["scale"], self.stride, self.temperature
-            return ClutteredDepth(self.renderer, camera, part, scale, lines=stride, temperature=temperature)
+            every, divisor = self.stride, self.temperature
+            return ClutteredDepth(self.renderer, camera, part, self.scale, lines=every, temperature=divisor)
         background, region = self.background.get(camera.name), grid(camera.height, camera.width, self.stride)
         noise = {"background": background, "region": region, **self.noise}
         return RobustDepth(self.renderer, camera, part, **noise)

@@ -209,7 +209,7 @@ def test_runs_that_all_died_say_so() -> None:
     dead = Population(importance(1, 5).trace, torch.full((5,), -torch.inf))
     runs = Repeated((dead, dead), (1, 2))
     assert "in runs 1, 2 no particle" in str(runs) and runs.log_evidence == -math.inf
-    for ask in (lambda: runs.mean("x"), lambda: runs.r_hat()):
+    for ask in (lambda: runs.mean("x"), lambda: runs.r_hat(), lambda: runs.pooled):
         with pytest.raises(NoWeightError, match="in any of 2 runs"):
             ask()
 
