@@ -32,7 +32,8 @@ from bcppl.geometry.turns import turns_freely
 from bcppl.inference.criticism import explanations
 from bcppl.inference.criticism.hypotheses import VERY_STRONG
 from bcppl.inference.criticism.rival_hypotheses import approximated, log_evidence
-from bcppl.inference.planning.metrology import ROCKED, three_two_one
+from bcppl.inference.planning.metrology import three_two_one
+from bcppl.inference.planning.metrology_parameters import ROCKED
 from bcppl.models.look_and_touch import model
 from bcppl.models.worlds.bench.scene import bench_scene
 from bcppl.sensors.likelihoods.bench_profiles import PROFILES

@@ -24,7 +24,8 @@ from scipy.spatial.transform import Rotation
 from bcppl import poses
 from bcppl.beliefs import Belief
 from bcppl.errors import InputError
-from bcppl.inference.planning.metrology import ROCKED, three_two_one
+from bcppl.inference.planning.metrology import three_two_one
+from bcppl.inference.planning.metrology_parameters import ROCKED
 from bcppl.models import load_recording
 from bcppl.models.worlds.bench.parameters import BenchParameters
 from bcppl.models.worlds.bench.scene import BenchScene, bench_scene

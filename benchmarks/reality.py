@@ -30,7 +30,8 @@ from bcppl.beliefs.regions import rotation_deviation, translation_deviation
 from bcppl.cli.predictive_checks import PredictiveChecks
 from bcppl.distributions.episodes.rows import COLUMNS
 from bcppl.inference.planning.insertion import insertion_plan
-from bcppl.inference.planning.metrology import ROCKED, three_two_one
+from bcppl.inference.planning.metrology import three_two_one
+from bcppl.inference.planning.metrology_parameters import ROCKED
 from bcppl.models.look_and_touch import model
 from bcppl.models.worlds.bench.errors import FAULTS, BenchErrors
 from bcppl.models.worlds.bench.parameters import BenchParameters

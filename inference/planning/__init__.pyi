@@ -8,10 +8,10 @@ from bcppl.inference.planning.insertion import (
     InsertionParameters as InsertionParameters,
     insertion_plan as insertion_plan,
 )
-from bcppl.inference.planning.metrology import (
+from bcppl.inference.planning.metrology import three_two_one as three_two_one
+from bcppl.inference.planning.metrology_parameters import (
     ROCKED as ROCKED,
     MetrologyParameters as MetrologyParameters,
-    three_two_one as three_two_one,
 )
 from bcppl.inference.planning.motion_constraints import (
     above_table as above_table,

@@ -18,7 +18,7 @@ from bcppl.geometry.gap import PegGap
 from bcppl.geometry.holes import Hole, hole_of
 from bcppl.geometry.parts import Part
 from bcppl.inference.planning.insertion import InsertionParameters, insertion_plan
-from bcppl.inference.planning.metrology import ROCKED
+from bcppl.inference.planning.metrology_parameters import ROCKED
 from bcppl.inference.planning.motions import expected_contacts
 from bcppl.inference.planning.touching import (
     UPRIGHT,

@@ -17,7 +17,7 @@ from bcppl.robot.plan import Manner
 from bcppl.sensors.plausibility.pegs import peg_doubt
 
 if TYPE_CHECKING:
-    from bcppl.inference.planning.metrology import MetrologyParameters
+    from bcppl.inference.planning.metrology_parameters import MetrologyParameters
     from bcppl.inference.planning.touching import TouchParameters
 
 

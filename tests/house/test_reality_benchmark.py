@@ -11,7 +11,8 @@ import torch
 
 from bcppl import poses
 from bcppl.beliefs import Belief
-from bcppl.inference.planning.metrology import ROCKED, MetrologyParameters, three_two_one
+from bcppl.inference.planning.metrology import three_two_one
+from bcppl.inference.planning.metrology_parameters import ROCKED, MetrologyParameters
 from bcppl.models.worlds.bench.scene import bench_scene
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))

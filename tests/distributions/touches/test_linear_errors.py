@@ -49,7 +49,8 @@ from bcppl.geometry.gap import PegGap
 from bcppl.inference import importance_sampling
 from bcppl.inference.criticism.nuisances import SuddenChange, shared_errors, sudden_changes
 from bcppl.inference.filters.default import infer
-from bcppl.inference.planning.metrology import ROCKED, three_two_one
+from bcppl.inference.planning.metrology import three_two_one
+from bcppl.inference.planning.metrology_parameters import ROCKED
 from bcppl.models import look_and_touch
 from bcppl.models.worlds.bench.errors import BenchErrors
 from bcppl.models.worlds.bench.parameters import BenchParameters

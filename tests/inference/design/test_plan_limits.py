@@ -12,7 +12,8 @@ from bcppl.arguments import pose_problem
 from bcppl.cli.candidates import planned
 from bcppl.errors import InputError
 from bcppl.geometry.extrusion import round_peg
-from bcppl.inference.planning.metrology import MetrologyParameters, three_two_one
+from bcppl.inference.planning.metrology import three_two_one
+from bcppl.inference.planning.metrology_parameters import MetrologyParameters
 from bcppl.inference.planning.motion_constraints import above_table, not_from_below
 from bcppl.inference.planning.motions import free_path, pressing_force
 from bcppl.models.worlds.bench.scene import bench_scene

@@ -29,7 +29,7 @@ from bcppl.inference.design import linearised_information_gain
 from bcppl.inference.design.relative_mixture import HeldPeg, RelativeMixture
 from bcppl.inference.design.tangent_mixture import TangentMixture
 from bcppl.inference.planning.candidate_layout import plan_candidates
-from bcppl.inference.planning.metrology import ROCKED
+from bcppl.inference.planning.metrology_parameters import ROCKED
 from bcppl.inference.planning.motions import expected_contacts
 from bcppl.inference.planning.touching import SurfacePoint, touch
 from bcppl.inference.population import Population

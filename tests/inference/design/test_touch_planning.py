@@ -20,7 +20,8 @@ from bcppl.geometry.extrusion import block, block_with_square_hole, box_peg, ext
 from bcppl.geometry.gap import PegGap
 from bcppl.geometry.parts import Part
 from bcppl.inference.planning.faces import boundary_points, points_on_top, section, sides
-from bcppl.inference.planning.metrology import ROCKED, MetrologyParameters, three_two_one
+from bcppl.inference.planning.metrology import three_two_one
+from bcppl.inference.planning.metrology_parameters import ROCKED, MetrologyParameters
 from bcppl.inference.planning.motions import expected_contacts
 from bcppl.inference.planning.touching import SurfacePoint, touch
 from bcppl.models.parts import insert_peg, insert_tray
