@@ -14,6 +14,7 @@ import time
 import warnings
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Sequence
+from copy import deepcopy
 from dataclasses import replace
 from typing import Any, Literal, TypeVar
 
@@ -98,6 +99,8 @@ class Filter:
         self._pages: list[LivePage] = []
         self._shared: dict[str, dict[str, Any]] = {}  # by kind and name, such as cameras
         self._under_way = 0  # measurements
+        self._arrived: list[Measurement] = []
+        self._left_out = 0
         self._failed: BaseException | None = None
         self._thread = Worker()
         try:
@@ -120,11 +123,13 @@ class Filter:
             InferenceError: an earlier one has ended the filter (`on_fault="stop"`).
             Exception: `on_update` has raised it, which ends the filter.
         """
-        measurement = Measurement(action, observation)
+        # What is observed is a copy: the caller may use its arrays again.
+        measurement = Measurement(action, deepcopy(observation))
         refuse(measurement, self._recording, self._shared)
         with self._changed:
             self._raise_failure()
             self._waiting.add(measurement, time.monotonic())
+            self._arrived.append(measurement)
         self._thread.submit(self._assimilate)
 
     # ---- what is known
@@ -143,6 +148,17 @@ class Filter:
     def recording(self) -> Recording:
         """What is assimilated, as a recording that `bcppl.save` writes."""
         return self._recording
+
+    @property
+    def arrived(self) -> Recording:
+        """What has arrived, also what waits or was left out, in that order."""
+        with self._changed:
+            return replace(self._recording, measurements=list(self._arrived))
+
+    @property
+    def left_out(self) -> int:
+        """How many measurements were left out; `updates` state why."""
+        return self._left_out
 
     @property
     def updates(self) -> Sequence[UpdateInfo]:
@@ -342,6 +358,7 @@ class Filter:
         update = UpdateInfo(joined, count, time.monotonic() - arrived, fault)
         with self._changed:
             self._updates.append(update)
+            self._left_out += joined if fault else 0
         for page in self._pages if not fault else []:
             show(page, self._step, self._recording, update)
         if self._on_update is not None:

@@ -9,6 +9,7 @@ A probe's stamps are stated before it begins: those of the plan that is about to
 
 from __future__ import annotations
 
+import threading
 from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -75,7 +76,8 @@ class Sampler:
 
     Streams may have any rates; values at the probe's stamps are interpolated, or means of a faster stream
     (`bcppl.recordings.streams`). A window is complete when both streams have gone on for `patience` after its
-    end, so that messages which are late by less may come in any order. What was irregular is counted.
+    end, so that messages which are late by less may come in any order. What was irregular is counted. Streams
+    may be given by a thread each, in arrays that are used again.
 
     Args:
         probe: its stamps are those of the windows, on the streams' clock.
@@ -104,6 +106,7 @@ class Sampler:
         number = np.floor((stamps - stamps[0]) / window + 1e-6)
         self._ends = [*(np.flatnonzero(np.diff(number)) + 1).tolist(), len(stamps)]
         self._first, self._done = 0, -np.inf
+        self._lock = threading.Lock()
         self.fault: InputError | None = None
 
     @property
@@ -126,7 +129,7 @@ class Sampler:
         Raises:
             InputError: a number is not finite, or messages were lost for too long.
         """
-        return self._add("wrench", stamp, np.asarray(wrench, dtype=np.float64))
+        return self._add("wrench", stamp, np.array(wrench, dtype=np.float64))
 
     def pose(self, stamp: float, world_from_peg: Sequence[float] | Array) -> list[Measurement]:
         """One message of the arm, and the windows that are complete with it.
@@ -143,7 +146,8 @@ class Sampler:
 
     def finish(self) -> list[Measurement]:
         """The windows that are complete without waiting any longer."""
-        return [] if self.fault else self._complete(0.0)
+        with self._lock:
+            return [] if self.fault else self._complete(0.0)
 
     def _add(self, name: str, stamp: float, values: Array) -> list[Measurement]:
         if self.fault is not None:
@@ -154,8 +158,9 @@ class Sampler:
                 f"a {name} message at {stamp} s has values {values.tolist()}; give {messages.width} "
                 "finite numbers."
             )
-        messages.add(float(stamp), values, self._done)
-        return self._complete(self.patience)
+        with self._lock:
+            messages.add(float(stamp), values, self._done)
+            return self._complete(self.patience)
 
     def _complete(self, patience: float) -> list[Measurement]:
         windows: list[Measurement] = []

@@ -7,6 +7,7 @@ import random
 import threading
 import warnings
 from collections.abc import Iterator
+from copy import deepcopy
 from dataclasses import replace
 from typing import Any
 
@@ -150,6 +151,21 @@ def test_a_measurement_that_nothing_explains_is_left_out_or_ends_it(touched: Rec
     assert after.taken == 3 and live.updates[-1].fault.startswith("window 3")
     assert before is not after.belief
     assert any("left out" in str(each.message) for each in caught)
+
+
+def test_arrays_of_measurements_may_be_used_again(touched: Recording) -> None:
+    first, empty, beliefs = touched.measurements[0], replace(touched, measurements=[]), []
+    for spoiled in (False, True):
+        with Filter(model, empty, particles=FEW, deadline=1e3) as live:
+            held = threading.Event()
+            live._thread.submit(held.wait)  # the filter is busy when it arrives
+            observation = deepcopy(first.observation)
+            live.observe(first.action, observation)
+            if spoiled:
+                observation.wrench[:] = 7.0
+            held.set()
+            beliefs.append(live.settle().belief)
+    assert torch.equal(beliefs[0].world_from_part, beliefs[1].world_from_part)
 
 
 def test_windows_after_one_that_is_left_out_or_overlaps_are_left_out(touched: Recording) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import random
+import sys
+import threading
 
 import numpy as np
 import pytest
@@ -108,3 +110,45 @@ def test_a_window_of_one_stamp_is_averaged_as_the_others_are() -> None:
     assert alone.action.last - alone.action.first == 1
     mean = noise[(times > 10.7449) & (times < 10.7551)].mean(axis=0)
     np.testing.assert_allclose(alone.observation.wrench[0], mean, atol=0.2)
+
+
+def test_arrays_of_messages_may_be_used_again() -> None:
+    buffers, got = {"wrench": np.empty(6), "pose": np.empty(7)}, list[Measurement]()
+    sampler = Sampler(probe())
+    for stamp, name, row in messages((500.0, 250.0)):
+        buffers[name][:] = row
+        got += getattr(sampler, name)(stamp, buffers[name])
+    expected = windows_of(Sampler(probe()), messages((500.0, 250.0)))
+    for one, other in zip(got, expected, strict=True):
+        assert np.array_equal(one.observation.wrench, other.observation.wrench)
+        assert np.array_equal(one.observation.world_from_peg, other.observation.world_from_peg)
+
+
+def test_streams_may_come_from_threads_of_their_own() -> None:
+    sampler, windows, errors = Sampler(probe(20.0)), list[Measurement](), list[Exception]()
+    turns = threading.Barrier(2)
+
+    def send(name: str, width: int) -> None:
+        try:
+            for number in range(21_000):
+                if number % 20 == 0:  # as far as one another, but for 20 ms
+                    turns.wait(60.0)
+                stamp = 9.9 + 0.001 * number
+                row = np.array([stamp, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0][:width])
+                windows.extend(getattr(sampler, name)(stamp, row))
+        except Exception as error:
+            errors.append(error)
+            turns.abort()
+
+    switching = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        threads = [threading.Thread(target=send, args=each) for each in (("wrench", 6), ("pose", 7))]
+        for each in threads:
+            each.start()
+        for each in threads:
+            each.join()
+    finally:
+        sys.setswitchinterval(switching)
+    assert not errors
+    assert sorted(w.action.first for w in windows) == list(range(0, 2000, 25))

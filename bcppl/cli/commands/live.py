@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from bcppl.arguments import LARGEST_SEED
+from bcppl.cli.interrupts import ended_like_an_interrupt
 from bcppl.cli.options import (
     Arm,
     Force,
@@ -47,6 +48,7 @@ DEADLINE = Annotated[
 VIEW = Annotated[
     bool, typer.Option("--view", help="Show part, particles and measurements on a page that follows.")
 ]
+RECORDING, BELIEF, ARRIVED = "recording.h5", "belief.h5", "arrived.h5"  # what `serve` keeps
 SOON = 10.0  # s within which a browser asks for a page
 
 
@@ -95,7 +97,11 @@ def live(
             report.row(step)
 
     settings: dict[str, Any] = {"particles": particles, "seed": seed, "deadline": deadline}
-    with Filter(chosen, empty, infer=infer, on_update=shown, **settings) as following:
+    failed: Exception | None = None
+    with (
+        ended_like_an_interrupt(),
+        Filter(chosen, empty, infer=infer, on_update=shown, **settings) as following,
+    ):
         page = following.view(recording, arm) if view or save else None
         asked = view and page is not None and _asked(page, console)
         report.row(following.step)
@@ -105,7 +111,13 @@ def live(
         except KeyboardInterrupt:
             interrupted = True
             console.print("interrupted; what has been measured is kept", style="yellow")
-        last = following.settle()
+        try:
+            last = following.settle()
+        except KeyboardInterrupt:
+            interrupted, last = True, following.step
+            console.print(f"interrupted; {following.behind} measurements are not assimilated", style="yellow")
+        except Exception as error:  # what was assimilated before it is shown and kept
+            failed, last = error, following.step
         report.recording = following.recording
         report.finish()
         console.print(lateness(following.updates, deadline))
@@ -117,6 +129,8 @@ def live(
     if out is not None:
         _save(last, following.recording, out)
         console.print(f"the belief is in {out}", markup=False)
+    if failed is not None:
+        raise failed
     if interrupted:
         raise KeyboardInterrupt
 
@@ -183,7 +197,7 @@ def serve(
             "--out",
             "-o",
             file_okay=False,
-            help="Folder for the recording of all that was measured, and the last belief, at the end.",
+            help="Folder for the last belief and its recording, at the end, and for all that arrived.",
         ),
     ] = None,
     view: VIEW = False,
@@ -206,7 +220,7 @@ def serve(
     from bcppl.recordings import save
 
     if out is not None:
-        for name in ("recording.h5", "belief.h5"):
+        for name in (RECORDING, BELIEF, ARRIVED):
             if (out / name).exists():
                 raise InputError(f"--out {out} has a {name} already; give another folder.")
         out.mkdir(parents=True, exist_ok=True)
@@ -214,7 +228,10 @@ def serve(
     measured, chosen, infer = _chosen(scene, model, inference, set_, begun=False)
     limits = [*candidates.off_table(table, measured.peg), *candidates.constraints(force)]
     settings: dict[str, Any] = {"particles": particles, "seed": seed, "deadline": deadline}
-    with Filter(chosen, measured, infer=infer, constraints=limits, **settings) as following:
+    with (
+        ended_like_an_interrupt(),
+        Filter(chosen, measured, infer=infer, constraints=limits, **settings) as following,
+    ):
         if view:
             _asked(following.view(scene), console)
         server = Server(Session(following), host, port, token)
@@ -222,10 +239,18 @@ def serve(
             asyncio.run(_serving(server, console))
         finally:
             if out is not None:
-                last = following.settle()
-                save(following.recording, out / "recording.h5")
-                _save(last, following.recording, out / "belief.h5")
-                console.print(f"recording and belief are in {out}", markup=False)
+                try:
+                    following.settle()
+                finally:  # whatever ended the filter, what was assimilated before it is kept
+                    save(following.recording, out / RECORDING)
+                    _save(following.step, following.recording, out / BELIEF)
+                    console.print(f"recording and belief are in {out}", markup=False)
+                    if left := following.left_out + following.behind:
+                        save(following.arrived, out / ARRIVED)
+                        console.print(
+                            f"{left} measurements are not in them; all that arrived is in {out / ARRIVED}",
+                            markup=False,
+                        )
 
 
 async def _serving(server: Server, console: Console) -> None:
