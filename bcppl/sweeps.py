@@ -29,6 +29,7 @@ from bcppl.untrusted import strict_json
 
 Argument = TypeVar("Argument")
 Result = TypeVar("Result")
+_STATED = 5  # reasons of failures
 _UNDER_WAY = 2  # times the number of jobs: what joblib sends out ahead
 Cell = Any  # what JSON holds: a mapping of settings by name, or a sequence of them
 
@@ -37,6 +38,29 @@ class Failure(NamedTuple):
     """Why a cell has no result: the name of an exception and what it says, in one line."""
 
     reason: str
+
+
+class CellsFailed(InferenceError):
+    """Cells of a sweep have failed; the others have ended.
+
+    Attributes:
+        failures: each cell that failed, and why.
+    """
+
+    def __init__(self, failed: Sequence[tuple[Cell, Failure]], total: int) -> None:
+        self.failures = [(cell, failure.reason) for cell, failure in failed]
+        reasons: dict[str, list[Cell]] = {}
+        for cell, reason in self.failures:
+            reasons.setdefault(reason, []).append(cell)
+        several = [
+            f"{json.dumps(cells[0])}{f' and {len(cells) - 1} more' if len(cells) > 1 else ''} with {reason}"
+            for reason, cells in list(reasons.items())[:_STATED]
+        ]
+        more = f"; and for {len(reasons) - _STATED} other reasons" if len(reasons) > _STATED else ""
+        super().__init__(
+            f"{len(failed)} of {total} cells failed, {'; '.join(several)}{more}; the same call tries these "
+            "again, and no other."
+        )
 
 
 def product(**axes: Iterable[Any]) -> list[dict[str, Any]]:
@@ -70,7 +94,7 @@ def swept(
 
     Raises:
         InputError: the file holds something else, or there is no such share or number of jobs.
-        InferenceError: (from the iterator) cells have failed.
+        CellsFailed: (from the iterator) cells have failed.
     """
     number, shares = share
     if not 1 <= number <= shares:
@@ -92,11 +116,7 @@ def _each(
         else:
             yield cell, result
     if failed:
-        cell, failure = failed[0]
-        raise InferenceError(
-            f"{len(failed)} of {len(mine)} cells failed, {json.dumps(cell)} with {failure.reason}; "
-            "the others are kept, and the same call tries the failed ones again."
-        )
+        raise CellsFailed(failed, len(mine))
 
 
 def in_order(
@@ -206,7 +226,7 @@ def _evaluated(function: Callable[[Any], Any], file: Path | None, cell: Cell) ->
         if file is not None:
             keep(file, cell, result)
         return result
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         return Failure(one_line(error))
     finally:
         torch.set_num_threads(threads)

@@ -229,9 +229,10 @@ def read_record(path: Path) -> dict[str, Any]:
         raise InputError(f"there is no run in {path}: it has no {RECORD}; give the folder of a run.")
     record = strict_json.read(path / RECORD, "run the recording again", finite=False)
     kinds = {"recording": str, "model": str, "inference": str, "particles": int, "seed": int}
-    kinds |= {"device": str, "settings": dict, "rows": list, "checked": dict}
+    kinds |= {"device": str, "settings": dict, "rows": list, "checked": dict, "files": dict}
     if isinstance(record, dict):
         record.setdefault("device", "cpu")  # of versions that had no other
+        record.setdefault("files", {})
     wrong = [] if isinstance(record, dict) else ["recording"]
     wrong = wrong or [name for name, kind in kinds.items() if not isinstance(record.get(name), kind)]
     wrong = wrong or [name for name, kind in _OF_LISTS.items() if not _all_are(kind, record.get(name))]

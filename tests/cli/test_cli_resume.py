@@ -145,6 +145,17 @@ def test_what_cannot_be_resumed_is_refused(bcppl: Callable[..., Ran], tmp_path: 
     assert "run.json is no valid JSON" in bcppl("run", "--resume", "out").err
 
 
+def test_a_run_whose_files_have_changed_does_not_go_on(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
+    save(short(1), tmp_path / "short.h5")
+    (tmp_path / "mine.py").write_text(FEW_MOVES.read_text())
+    words = ("--inference", "mine.py")
+    assert bcppl("run", "short.h5", "--particles", 4, *words, "--out", "out").code == 0
+    assert bcppl("run", "--resume", "out", *words).code == 0
+    (tmp_path / "mine.py").write_text(FEW_MOVES.read_text() + "\n# other moves\n")
+    ran = bcppl("run", "--resume", "out", *words)
+    assert ran.code == 2 and "mine.py has changed since the run in out was begun" in ran.err
+
+
 @pytest.mark.long
 def test_an_inference_program_without_start_is_named(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
     (tmp_path / "plain.py").write_text(

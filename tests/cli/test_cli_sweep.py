@@ -62,6 +62,9 @@ def test_a_changed_file_is_another_cell_and_a_failure_is_tried_again(
     words = ("--inference", "mine.py", *WORDS[2:])
     ran = bcppl("sweep", "log.h5", *words)
     assert ran.code == 1 and "1 of 1 cells failed" in ran.err and "no particle is left" in ran.err
+    with (tmp_path / "found/results.csv").open() as file:
+        (row,) = csv.DictReader(file)
+    assert row["recording"] == "log.h5" and row["error"].endswith("no particle is left.")
     (tmp_path / "mine.py").write_text(mine)
     assert bcppl("sweep", "log.h5", *words).code == 0
     assert len((tmp_path / "found/results.jsonl").read_text().splitlines()) == 1
@@ -85,6 +88,10 @@ def test_a_setting_that_is_a_file_is_read_again_where_it_has_changed(
         assert ran.code == 0, ran.err
     kept = [json.loads(line)[1] for line in (tmp_path / "found/results.jsonl").read_text().splitlines()]
     assert len(kept) == 2 and kept[0]["log_evidence"] != kept[1]["log_evidence"]
+    with (tmp_path / "found/results.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["set.spread"] for row in rows] == ["spread.txt"] * 2, "those of earlier calls are there"
+    assert all(len(json.loads(row["spread"])) == 6 for row in rows), "the belief's is another"
 
 
 def test_what_cannot_be_swept_is_refused_in_a_sentence(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
@@ -99,6 +106,8 @@ def test_what_cannot_be_swept_is_refused_in_a_sentence(bcppl: Callable[..., Ran]
         (("sweep", "a.h5", "--share", "3"), "give K/N"),
         (("sweep", "a.h5", "--share", "3/2"), "share 3 of 2 does not exist"),
         (("sweep", "a.h5", "--backend", "slurm"), "there is no backend 'slurm'"),
+        (("sweep", "a.h5", "--model", "no_such_model"), "no_such_model"),
+        (("sweep", "a.h5", "--model", "point_probe", "--inference", "no_such"), "no_such"),
     ):
         ran = bcppl(*words)
         assert ran.code == 2 and said in ran.err and not (tmp_path / "sweep").exists(), (words, ran.err)

@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from bcppl.errors import InferenceError, InputError
-from bcppl.sweeps import as_they_end, in_order, keep, kept, key_of, product, swept
+from bcppl.sweeps import CellsFailed, as_they_end, in_order, keep, kept, key_of, product, swept
 
 CELLS = product(scale=[1.0, 2.0], seed=range(4))
 SLOW = """
@@ -128,3 +128,18 @@ def plus_one(cell: dict[str, int]) -> int:
 def test_a_cell_that_json_does_not_hold_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"PosixPath.*which JSON does not hold.*str\(path\)"):
         list(swept(plus_one, product(seed=[tmp_path])))
+
+
+def leaving(cell: dict[str, int]) -> int:
+    if cell["seed"] % 2:
+        raise SystemExit(3)
+    return cell["seed"]
+
+
+def test_reasons_of_failures_are_stated_once_each_and_none_ends_the_sweep() -> None:
+    done = swept(leaving, product(seed=range(5)))
+    assert [next(done)[1] for _ in range(3)] == [0, 2, 4]
+    stated = r'2 of 5 cells failed, \{"seed": 1\} and 1 more with SystemExit: 3'
+    with pytest.raises(CellsFailed, match=stated) as failed:
+        next(done)
+    assert [cell["seed"] for cell, _ in failed.value.failures] == [1, 3]

@@ -63,6 +63,7 @@ def run(
     from rich.console import Console
 
     from bcppl.cli import loading
+    from bcppl.cli.digests import digests_of, refuse_changed
     from bcppl.cli.predictive_checks import PredictiveChecks
     from bcppl.cli.report import Report
     from bcppl.cli.run_folder import PAGE, STEP, RunFolder, beside, read_record
@@ -89,6 +90,7 @@ def run(
         record["recording"] = recording = recording or record["recording"]
         particles, seed = record["particles"], record["seed"]
         device = record["device"]
+        refuse_changed(record.get("files", {}), resume)
     if recording is None:
         raise InputError("there is nothing to run; give a recording, or the folder of a run by --resume.")
     with catch_warnings(record=True) as warned:
@@ -137,6 +139,7 @@ def run(
                 "seed": seed,
                 "device": device,
                 "settings": settings,
+                "files": digests_of([model or named, inference, *settings.values()]),
                 "doubts": doubted,
             },
             begun=resume is not None,

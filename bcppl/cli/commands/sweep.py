@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import hashlib
+import json
 import math
 import time
 from collections.abc import Mapping, Sequence
@@ -15,9 +16,10 @@ from typing import Annotated, Any
 import typer
 
 from bcppl.arguments import LARGEST_SEED
+from bcppl.cli.digests import digest
 from bcppl.cli.options import Settings
 from bcppl.errors import InputError
-from bcppl.sweeps import key_of, product, swept
+from bcppl.sweeps import CellsFailed, kept, key_of, product, swept
 
 RESULTS, TABLE, BELIEFS = "results.jsonl", "results.csv", "beliefs"  # in the folder
 WIDTH = 100  # columns of the table at least, also where the output is no terminal
@@ -76,7 +78,8 @@ def sweep(
     cells = list({key_of(cell): cell for cell in cells}.values())
     words = {v for each in settings for v in each.values() if isinstance(v, str)}
     stated = {word for word in words if Path(word).is_file()}
-    digests = {name: _digest(name) for name in {*named, *models, *programs, *stated}}
+    _refuse_wrong(models, programs, settings)
+    digests = {name: digest(name) for name in {*named, *models, *programs, *stated}}
     for cell in cells:
         given = [each for each in cell["settings"].values() if isinstance(each, str) and each in stated]
         cell["contents"] = [digests[name] for name in (*(cell[name] for name in FILES), *given)]
@@ -90,18 +93,22 @@ def sweep(
             share=(number, shares),
         )
         (out / BELIEFS).mkdir(parents=True, exist_ok=True)
-        found = []
+        found, failed = [], list[tuple[Mapping[str, Any], str]]()
         try:
             total = len(cells[number - 1 :: shares])
             for each in watched(done, total=total, description="runs"):
                 found.append(each)
+        except CellsFailed as error:
+            failed = error.failures
+            raise
         finally:
             # Whatever stopped the sweep, what was computed is shown.
             console = Console(highlight=False)
             console.width = max(console.width, WIDTH)
             if found:
                 console.print(_table(found))
-                _write(found, out / TABLE)
+            if found or failed:
+                _write(out, failed)
                 console.print(f"{len(found)} of {len(cells)} runs are in {out}", markup=False)
 
 
@@ -201,12 +208,14 @@ def _settings(given: Sequence[str]) -> list[dict[str, Any]]:
     return product(**axes)
 
 
-def _digest(name: str) -> str:
-    """Of a file's bytes, else of the version that has what is named: results of another one are others."""
-    from importlib.metadata import version
+def _refuse_wrong(models: Sequence[str], programs: Sequence[str], settings: Sequence[Any]) -> None:
+    """Refuse before the first run what every one would refuse, unless recordings name the model."""
+    from bcppl.cli import loading
 
-    content = Path(name).read_bytes() if Path(name).is_file() else version("bcppl").encode()
-    return hashlib.sha256(content).hexdigest()[:16]
+    for model in filter(None, models):
+        chosen = [loading.with_settings(loading.model(model), each, model) for each in settings]
+        for program in filter(None, programs):
+            loading.inference(program, chosen[0])
 
 
 def _share(text: str) -> tuple[int, int]:
@@ -280,15 +289,20 @@ def _table(found: Sequence[tuple[Mapping[str, Any], Mapping[str, Any]]]) -> Any:
     return table
 
 
-def _flat(cell: Mapping[str, Any]) -> dict[str, Any]:
-    return {**{k: v for k, v in cell.items() if k != "settings"}, **cell["settings"]}
+def _flat(cell: Mapping[str, Any], before: str = "") -> dict[str, Any]:
+    """A cell's entries and its settings, by their names with something before these."""
+    settings = {f"{before}{name}": value for name, value in cell["settings"].items()}
+    return {**{k: v for k, v in cell.items() if k != "settings"}, **settings}
 
 
-def _write(found: Sequence[tuple[Mapping[str, Any], Mapping[str, Any]]], path: Path) -> None:
-    """All results as a table that other programs read."""
+def _write(out: Path, failed: Sequence[tuple[Mapping[str, Any], str]]) -> None:
+    """All results of a folder, and why others have none, as a table that other programs read."""
     from bcppl.recordings.hdf5 import replacing
 
-    rows = [{**_flat(cell), **result} for cell, result in found]
+    path, found = out / TABLE, [(json.loads(key), result) for key, result in kept(out / RESULTS).items()]
+    found += [(cell, {"error": reason}) for cell, reason in failed]
+    # A setting may have the name of a result, such as `spread`.
+    rows = [{**_flat(cell, "set."), **result} for cell, result in found]
     names = list(dict.fromkeys(name for row in rows for name in row))
     with replacing(path) as beside, beside.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, names)
