@@ -135,8 +135,8 @@ def generate_stratified(
 
     Raises:
         InputError: a count is no whole number, 1 or more, there is no latent choice, a number of strata is
-            given for a discrete one, there are fewer particles than strata, or no inverse distribution
-            function and no function given.
+            given for a discrete one, a function gives another shape than (M,), there are fewer particles than
+            strata, or no inverse distribution function and no function given.
     """
     candidates = whole_number("generate_stratified is given {} candidates for each particle", candidates)
     if strata is not None and not callable(strata):
@@ -147,7 +147,14 @@ def generate_stratified(
     address = next(a for a in trace.addresses if a in trace.choices)
     if callable(strata):
         wide = generate(program, args, observations, particles * candidates)
-        return _selected(*wide, strata(wide[0][address]), particles)
+        stratum: Any = strata(wide[0][address])
+        if not isinstance(stratum, Tensor) or stratum.shape != (len(wide[0]),):
+            given = tuple(stratum.shape) if isinstance(stratum, Tensor) else type(stratum).__name__
+            raise InputError(
+                f"strata gives {given} for {len(wide[0])} values of {address!r}; give a tensor with the "
+                "number of each one's stratum."
+            )
+        return _selected(*wide, stratum, particles)
 
     def started(values: Tensor) -> tuple[Trace, Tensor]:
         return generate(program, args, observations, particles, {address: values})

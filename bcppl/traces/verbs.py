@@ -32,7 +32,7 @@ FEW = 20
 def refuse_no_trace(where: str, given: Any) -> None:
     """Refuse what is no trace."""
     if not isinstance(given, Trace):
-        own = f"; of particles with weights, bcppl.inference.{where}" if hasattr(given, "trace") else ""
+        own = "; give its `.trace`" if hasattr(given, "trace") else ""
         raise InputError(f"{where} is given a {type(given).__name__} in place of a trace{own}.")
 
 

@@ -131,8 +131,10 @@ def neighbour_entropy(address: str, neighbours: int = 3) -> Entropy:
 
     Kozachenko and Leonenko 1987, weighted as in `bcppl.beliefs.entropy.nearest_neighbour_entropy`, except
     that the local weight is the mean over a particle and its k neighbours, so that it is not 0 where a
-    measurement leaves a single particle. Distances are Mahalanobis distances of the population, whatever the
-    weights. It needs several hundred particles in six dimensions.
+    measurement leaves a single particle. Where candidates bring latent values of their own, the weights of
+    neighbours differ at random, a particle's own counts too much, and gains are too large by tenths of a nat:
+    use `mixture_entropy` there. Distances are Mahalanobis distances of the population, whatever the weights.
+    It needs several hundred particles in six dimensions.
 
     Args:
         address: of a latent site, of poses or of other real values.

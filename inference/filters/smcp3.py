@@ -230,7 +230,7 @@ def moved_trace(
                 (FORWARD, a): returned[a] for a in chosen.choices
             }
 
-        refuse_unequal("a pair", log_jacobian, log_abs_det_jacobian(undo, outputs, inputs))
+        refuse_unequal("a pair", log_jacobian, log_abs_det_jacobian(undo, outputs, inputs), inputs)
     log_chosen = chosen.log_prob()
     log_factor = log_ratio + reverse.log_prob() - log_chosen + log_jacobian
     # A choice without density has left the range of its type (see `metropolis_hastings`).

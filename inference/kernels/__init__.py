@@ -19,12 +19,12 @@ A kernel is fitted to a population; its moves then leave any target invariant. K
 `sequence`, `cycle`, `mixture` and `repeat`.
 """
 
-from bcppl.inference.kernels.combinators import composed, cycle, mixture, repeat, sequence
+from bcppl.inference.kernels.combinators import cycle, mixture, repeat, sequence
 from bcppl.inference.kernels.halving import halved, halves
 from bcppl.inference.kernels.hamiltonian import hmc
 from bcppl.inference.kernels.hastings import metropolis_hastings
 from bcppl.inference.kernels.involutions import involutive
-from bcppl.inference.kernels.kernel import Kernel, Move, fitted, scattered
+from bcppl.inference.kernels.kernel import Kernel, Move, composed, fitted, scattered
 from bcppl.inference.kernels.rejuvenation import Until, displacement, moved_by, until
 from bcppl.inference.kernels.staged import (
     Surrogate,

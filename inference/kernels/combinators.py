@@ -7,7 +7,7 @@ proposals. All raise InputError where no kernel is given, or something else, suc
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import groupby
 from typing import Any
 
@@ -20,9 +20,11 @@ from bcppl.inference.kernels.kernel import (
     Kernel,
     Move,
     fitted,
+    in_sequence,
     is_reversible,
     learns,
     marked,
+    parts_of,
     refuse_no_kernel,
     scattered,
 )
@@ -66,23 +68,7 @@ def _listed(name: str, kernels: Sequence[Kernel | Sequence[Kernel]]) -> list[Ker
 def sequence(*kernels: Kernel | Sequence[Kernel]) -> Kernel:
     """One kernel after another, in the order given, one by one or as a list."""
     listed = _listed("sequence", kernels)
-    together = _one_after_another(listed)
-    vars(together)["parts"] = listed
-    return together
-
-
-def composed(of: Callable[[Population], Kernel]) -> Kernel:
-    """A kernel that is put together for each sweep: `of(population)` gives it.
-
-    What is put together may depend on which sites the trace has and on the approximation that the population
-    carries, and be drawn at random; not on where the particles are.
-    """
-
-    def kernel(population: Population) -> Move:
-        return fitted(of(population), population)
-
-    vars(kernel)["of"] = of
-    return kernel
+    return in_sequence(_one_after_another(listed), listed)
 
 
 def in_parts(kernel: Kernel, population: Population) -> list[tuple[Kernel, int]]:
@@ -90,15 +76,8 @@ def in_parts(kernel: Kernel, population: Population) -> list[tuple[Kernel, int]]
 
     Each comes with how many moves it is made of.
     """
-    groups = [list(group) for _, group in groupby(_flat(kernel, population), key=learns)]
+    groups = [list(group) for _, group in groupby(parts_of(kernel, population), key=learns)]
     return [(each[0] if len(each) == 1 else _one_after_another(each), len(each)) for each in groups]
-
-
-def _flat(kernel: Kernel, population: Population) -> list[Kernel]:
-    of, parts = getattr(kernel, "of", None), getattr(kernel, "parts", None)
-    if of is not None:
-        return _flat(of(population), population)
-    return [kernel] if parts is None else [each for part in parts for each in _flat(part, population)]
 
 
 def cycle(*kernels: Kernel | Sequence[Kernel]) -> Kernel:

@@ -80,7 +80,7 @@ def involutive(program: Proposal, involution: Involution, *, check: bool = False
             log_forward = log_jacobian(start, after)
             if check:
                 refuse_apart("the involution, applied twice,", before, mapped(after))
-                refuse_unequal("the involution", log_forward, log_jacobian(after, mapped(after)))
+                refuse_unequal("the involution", log_forward, log_jacobian(after, mapped(after)), before)
             updated = update(trace, new)
             refuse_observed("the program of an involution", forward.choices, updated.trace)
             choices = {a: v for (kind, a), v in after.items() if kind == "choice"}

@@ -265,10 +265,13 @@ def refuse_apart(what: str, first: Point, second: Mapping[Key, Tensor]) -> None:
             )
 
 
-def refuse_unequal(what: str, forward: Tensor, reverse: Tensor) -> None:
-    """Refuse log-Jacobians (N,) of a move and of its reverse that do not cancel."""
+def refuse_unequal(what: str, forward: Tensor, reverse: Tensor, moved: Point) -> None:
+    """Refuse log-Jacobians (N,) of a move of some values and of its reverse that do not cancel."""
+    digits = [torch.finfo(v.dtype).eps for v, _ in moved.values() if v.is_floating_point()]
+    # A map that stretches by much loses as many digits of what it stretches.
+    limit = (64.0 * max(digits, default=0.0) * forward.detach().abs().exp()).clamp(1e-6, 0.05)
     # Both infinite where a map is singular: their sum is no number, and is refused.
-    wrong = ~((forward + reverse).abs() <= 1e-6)
+    wrong = ~((forward + reverse).abs() <= limit)
     if bool(wrong.any()):
         particle = int(wrong.nonzero()[0])
         raise InputError(

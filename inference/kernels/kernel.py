@@ -9,8 +9,8 @@ a share between the two for a move that is made of several.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterable
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import torch
@@ -48,7 +48,7 @@ def is_reversible(kernel: Kernel) -> bool:
     Those of `metropolis_hastings`, `hmc` and `involutive` do, and combinations of them but for a `sequence`
     that does not read the same backwards. A kernel of one's own does if it is `marked` so.
     """
-    return bool(getattr(kernel, "reversible", False))
+    return _marks_of(kernel).reversible
 
 
 def learns(kernel: Callable[..., Any]) -> bool:
@@ -58,13 +58,59 @@ def learns(kernel: Callable[..., Any]) -> bool:
     one's own is taken to, unless it is `marked` otherwise. Moves that do not need no other particles: the
     whole population makes them at once.
     """
-    return bool(getattr(kernel, "learns", True))
+    return _marks_of(kernel).learns
+
+
+@dataclass(frozen=True, eq=False)
+class _Marks:
+    """What is known of a kernel. One that wraps it, and may have copied its attributes, is another."""
+
+    kernel: Any
+    reversible: bool = False
+    learns: bool = True
+    of: Callable[[Population], Kernel] | None = None
+    parts: Sequence[Kernel] | None = None
+
+
+def _marks_of(kernel: Any) -> _Marks:
+    known = getattr(kernel, "_marks", None)
+    return known if isinstance(known, _Marks) and known.kernel is kernel else _Marks(kernel)
 
 
 def marked(kernel: Function, *, reversible: bool = True, learns: bool = True) -> Function:
     """The kernel, with marks that `is_reversible` and `learns` read."""
-    vars(kernel).update(reversible=reversible, learns=learns)
+    vars(kernel)["_marks"] = replace(_marks_of(kernel), reversible=reversible, learns=learns)
     return kernel
+
+
+def composed(of: Callable[[Population], Kernel]) -> Kernel:
+    """A kernel that is put together for each sweep: `of(population)` gives it.
+
+    What is put together may depend on which sites the trace has and on the approximation that the population
+    carries, and be drawn at random; not on where the particles are.
+    """
+
+    def kernel(population: Population) -> Move:
+        return fitted(of(population), population)
+
+    vars(kernel)["_marks"] = _Marks(kernel, of=of)
+    return kernel
+
+
+def in_sequence(kernel: Function, parts: Sequence[Kernel]) -> Function:
+    """The kernel, known to be these one after another."""
+    vars(kernel)["_marks"] = replace(_marks_of(kernel), parts=parts)
+    return kernel
+
+
+def parts_of(kernel: Kernel, population: Population) -> list[Kernel]:
+    """The kernels that one which is composed, or a sequence, is made of for a population; else itself."""
+    marks = _marks_of(kernel)
+    if marks.of is not None:
+        return parts_of(marks.of(population), population)
+    if marks.parts is None:
+        return [kernel]
+    return [each for part in marks.parts for each in parts_of(part, population)]
 
 
 def weighted(population: Population) -> Population:

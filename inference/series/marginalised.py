@@ -28,12 +28,15 @@ from torch import Tensor
 from bcppl.arguments import number_within, whole_number
 from bcppl.distributions.lazy import LazyDistribution
 from bcppl.errors import InputError
-from bcppl.inference.series.nested import Filters
+from bcppl.inference.series.nested import Filters, Shared
 from bcppl.inference.series.unrolling import numbered, refuse_no_steps
 from bcppl.traces import Series, carried, simulate
+from bcppl.traces.dependence.equality import comparison
 from bcppl.traces.differentiation.graph import kept
 from bcppl.traces.run import run
 from bcppl.traces.series import SeriesTrace
+
+_REMEMBERED = 8  # arguments of `init`
 
 
 class SeriesLikelihood(LazyDistribution):
@@ -131,6 +134,7 @@ class Marginal:
     particles: int
     threshold: float
     _shapes: dict[Hashable, tuple[int, ...]] = field(default_factory=dict, repr=False)
+    _given: list[Shared] = field(default_factory=list, repr=False)
 
     def __call__(self, steps: Sequence[tuple[Any, ...]], *args: Any) -> None:
         """Sample the static parameters, and visit the observation of each step."""
@@ -143,7 +147,13 @@ class Marginal:
             )
         values = [parameters.values[address] for address in self.static]
         begin = partial(
-            Filters.before, self.series, args, self.particles, self.threshold, self.static, *values
+            Filters.before,
+            self.series,
+            self._shared(args),
+            self.particles,
+            self.threshold,
+            self.static,
+            *values,
         )
         filters = carried(f"filters of {self.observed}", begin)
         filters.restart_where_changed(steps)
@@ -151,6 +161,19 @@ class Marginal:
             shape = self._event_shape(args, each)
             site = SeriesLikelihood(filters, number, self.observed, each, shape)
             pyro.sample(numbered(self.observed, number), site)
+
+    def _shared(self, args: tuple[Any, ...]) -> Shared:
+        """The arguments of `init`, as one object from run to run.
+
+        Of parts of it that have as many entries as there are particles, each would be taken for a particle's
+        own, and filters be made again where particles have other places.
+        """
+        for known in self._given:
+            if comparison()(known.args, args):
+                return known
+        self._given.append(Shared(args))
+        del self._given[:-_REMEMBERED]
+        return self._given[-1]
 
     def _event_shape(self, args: tuple[Any, ...], step: tuple[Any, ...]) -> tuple[int, ...]:
         """The shape of the observation, from one run of a step with arguments of this kind."""

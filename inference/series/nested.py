@@ -24,6 +24,13 @@ from bcppl.traces.indexing import indexed
 from bcppl.traces.series import SeriesTrace, resumed
 
 
+@dataclass(frozen=True, eq=False)
+class Shared:
+    """Arguments that all particles share, whatever their sizes."""
+
+    args: tuple[Any, ...]
+
+
 @dataclass(eq=False)
 class Filters:
     """M filters after T steps: indexed and merged by filter, and run on when a later step is asked for.
@@ -65,7 +72,7 @@ class Filters:
     def before(
         cls,
         series: Series,
-        args: tuple[Any, ...],
+        shared: Shared,
         count: int,
         threshold: float,
         addresses: tuple[str, ...],
@@ -74,7 +81,8 @@ class Filters:
         """Filters before the first step, at values (M, *event) of static parameters."""
         weights = torch.full((len(values[0]), count), groups.equal(count), dtype=torch.float64)
         static = dict(zip(addresses, values, strict=True))
-        return cls(series, args, static, count, threshold, weights, weights.new_empty(0, len(weights)))
+        none = weights.new_empty(0, len(weights))
+        return cls(series, shared.args, static, count, threshold, weights, none)
 
     def branched(self) -> Filters:
         """The same filters, which run on without these."""
@@ -89,7 +97,7 @@ class Filters:
         if ran <= len(steps) and all(map(are_same, [then[1] for then in self.seen], steps[:ran])):
             return
         addresses, values = tuple(self.static), self.static.values()
-        start = self.before(self.series, self.args, self.count, self.threshold, addresses, *values)
+        start = self.before(self.series, Shared(self.args), self.count, self.threshold, addresses, *values)
         vars(self).update(vars(start))
 
     def log_increment(self, number: int, address: str, args: tuple[Any, ...], value: Tensor) -> Tensor:

@@ -14,6 +14,9 @@ from bcppl.errors import InputError
 from bcppl.traces.carried import Entry
 from bcppl.traces.indexing import broadcast
 
+# What particles cannot differ in.
+_SHARED = (bool, int, float, complex, str, bytes, type(None))
+
 
 def merged(mask: Tensor, first: Any, second: Any) -> Any:
     """The states (N, ...) of the first where `mask` (N,) is true, of the second elsewhere.
@@ -52,13 +55,17 @@ def merged_entries(mask: Tensor, first: Mapping[str, Entry], second: Mapping[str
 def same(first: Any, second: Any, particles: int) -> Tensor:
     """Where the states of two batches of particles are equal but for rounding, (N,).
 
-    Only tensors and arrays are compared: what else a state holds counts as equal.
+    Tensors and arrays with an entry for each particle are compared, also those that objects hold as
+    attributes; what all particles share counts as equal.
+
+    Raises:
+        InputError: a state holds an object whose attributes cannot be read.
     """
     if isinstance(first, np.ndarray):
         return same(torch.from_numpy(first), torch.from_numpy(second), particles)
     equal = torch.ones(particles, dtype=torch.bool)
     if isinstance(first, Tensor):
-        if first.ndim == 0 or first is second:
+        if first.ndim == 0 or first is second or len(first) != particles:
             return equal
         if first.is_floating_point():
             # A batch of another size may round the last digits in another way. In single precision a few
@@ -72,6 +79,13 @@ def same(first: Any, second: Any, particles: int) -> Tensor:
         parts = [same(value, second[key], particles) for key, value in first.items()]
     elif isinstance(first, list | tuple):
         parts = [same(a, b, particles) for a, b in zip(first, second, strict=True)]
-    else:
+    elif first is second or isinstance(first, _SHARED):
         return equal
+    elif hasattr(first, "__dict__"):
+        parts = [same(value, vars(second)[name], particles) for name, value in vars(first).items()]
+    else:
+        raise InputError(
+            f"a series' state holds a {type(first).__name__}, whose particles cannot be compared with those "
+            "of another; let it hold tensors as attributes (no __slots__), or hold tensors."
+        )
     return torch.stack([equal, *parts]).all(dim=0)

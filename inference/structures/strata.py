@@ -217,11 +217,11 @@ def mean(strata: Strata, address: str) -> Tensor:
     Raises:
         InputError: a structure does not visit the address, or the values' shapes differ.
     """
-    distribution = next(iter(strata.populations.values())).trace.distributions[address]
+    weights, values = normalised(strata.log_weights), strata[address].to(torch.float64)
+    distribution = next(iter(strata.populations.values())).trace.distributions.get(address)
     if freedom_of(distribution) is not None:
         return strata.belief(address).mean
-    weights, values = normalised(strata.log_weights), strata[address].to(torch.float64)
-    if not is_of_angles(distribution):
+    if distribution is None or not is_of_angles(distribution):
         return torch.einsum("n,n...->...", weights, values)
     sine, cosine = (torch.einsum("n,n...->...", weights, each) for each in (values.sin(), values.cos()))
     return torch.atan2(sine, cosine)

@@ -118,7 +118,7 @@ def translated(
         refuse_apart("the backward program", inputs, ends | {(FORWARD, a): v for a, v in forth.items()})
         if inputs or outputs:
             undo = partial(_mapped, "backward", backward, new, outputs, inputs)
-            refuse_unequal("a translator", log_jacobian, log_abs_det_jacobian(undo, outputs, inputs))
+            refuse_unequal("a translator", log_jacobian, log_abs_det_jacobian(undo, outputs, inputs), inputs)
     log_chosen = chosen.log_prob()
     log_sampled = new.log_prob(*sampled) if sampled else zero
     log_lost = old.log_prob(*lost) if lost else zero

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pyro
@@ -229,3 +230,12 @@ def test_a_number_of_strata_is_refused_for_a_discrete_choice() -> None:
 
     with pytest.raises(InputError, match="leave strata out"):
         generate_stratified(program, (), {"y": torch.tensor(0.3).double()}, 6, 2)
+
+
+@pytest.mark.parametrize("strata", [lambda v: v > 0, lambda v: v[:, :1], lambda v: None, lambda v: v[:3, 0]])
+def test_strata_of_another_shape_are_refused(strata: Any) -> None:
+    def program() -> None:
+        pyro.sample("x", dist.Normal(torch.zeros(2).double(), 1.0).to_event(1))
+
+    with pytest.raises(InputError, match="give a tensor with the number of each one's stratum"):
+        generate_stratified(program, (), {}, 4, strata)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import wraps
 from importlib import import_module
 
 import pyro
@@ -18,6 +19,7 @@ from bcppl.inference.filters.smcp3 import Pair, move_and_weight
 from bcppl.inference.filters.waste_free import waste_free_moves
 from bcppl.inference.kernels import (
     Kernel,
+    Move,
     composed,
     halved,
     halves,
@@ -25,7 +27,7 @@ from bcppl.inference.kernels import (
     moved_by,
     sequence,
 )
-from bcppl.inference.proposals import Fittable, drift, independent
+from bcppl.inference.proposals import Fittable, drift, independent, prior
 from bcppl.inference.resampling import systematic
 from bcppl.inference.targets import POSTERIOR
 from bcppl.traces import Trace, simulate
@@ -274,3 +276,25 @@ def test_what_learns_nothing_moves_all_at_once_also_beside_what_learns() -> None
     assert abs(float(x.mean())) < 4.5 / math.sqrt(4000)
     assert abs(float(x.var()) - 1.0) < 4.5 * math.sqrt(2.0 / 4000)
     assert 0.3 < done.acceptance < 0.8
+
+
+def test_what_wraps_a_kernel_is_called_whatever_it_has_copied() -> None:
+    """Marks are of the kernel that has them: `functools.wraps` copies attributes, and a class has its own."""
+    inner, calls = sequence(metropolis_hastings(drift("x")), metropolis_hastings(prior("x"))), list[int]()
+
+    @wraps(inner)
+    def wrapped(population: Population) -> Move:
+        calls.append(len(population))
+        return inner(population)
+
+    class Own:
+        parts, of, learns = 3, "x", False
+
+        def __call__(self, population: Population) -> Move:
+            return wrapped(population)
+
+    start = Population(simulate(gaussian, (), 40))
+    for kernel in (wrapped, Own()):
+        calls.clear()
+        moved_by(start, kernel, POSTERIOR)
+        assert sorted(calls) == [20, 20], "by halves, as of a kernel of which nothing is known"

@@ -12,7 +12,15 @@ import torch
 from torch import Tensor
 
 from bcppl.errors import InputError
-from bcppl.inference import Observed, importance_sampling, markov_chains, steps, tempered
+from bcppl.inference import (
+    Observed,
+    importance_sampling,
+    markov_chains,
+    rejuvenate,
+    resample,
+    steps,
+    tempered,
+)
 from bcppl.inference.kernels import hmc, metropolis_hastings
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import drift
@@ -392,3 +400,26 @@ def test_a_number_of_steps_is_no_list_of_them() -> None:
     for given in (3, [1, 2]):
         with pytest.raises(InputError, match=r"give a list of the arguments of each step"):
             generate(program, (given,), {}, 5)
+
+
+@pytest.mark.parametrize("entries", [40, 41])
+def test_an_argument_with_as_many_entries_as_there_are_particles_is_no_particle_s_own(entries: int) -> None:
+    """Filters go on where particles are resampled and moved, whatever the size of `init`'s arguments."""
+
+    def begin(scales: Tensor) -> dict[str, Tensor]:
+        rho = pyro.sample("rho", dist.Uniform(-1.0, 1.0))
+        return {"rho": rho, "x": pyro.sample("x", dist.Normal(0.0, scales.mean()))}
+
+    def step(state: dict[str, Tensor]) -> dict[str, Tensor]:
+        x = pyro.sample("x", dist.Normal(state["rho"] * state["x"], 1.0))
+        pyro.sample("y", dist.Normal(x, 0.3))
+        return {"rho": state["rho"], "x": x}
+
+    torch.manual_seed(0)
+    program, scales = marginal(Series(begin, step), "rho", observed="y", particles=5), torch.ones(entries)
+    seen = {f"y/{t}": torch.tensor(y) for t, y in enumerate((1.5, 1.2, 2.0, 1.0, 2.5), 1)}
+    population = resample(importance_sampling(program, ([()] * 5, scales), seen, 40))
+    trace = rejuvenate(population, metropolis_hastings(drift("rho"))).trace
+    longer, _ = extend(trace, ([()] * 6, scales), {"y/6": torch.tensor(2.0)})
+    known = torch.stack([longer.log_prob(address) for address in seen])
+    assert torch.equal(longer.distributions["y/6"].filters.increments[:5], known)

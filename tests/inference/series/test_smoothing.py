@@ -17,6 +17,7 @@ from bcppl.inference.kernels import metropolis_hastings
 from bcppl.inference.proposals import drift
 from bcppl.inference.resampling import adaptive, always, never
 from bcppl.inference.series import smooth, smoothing, unrolled
+from bcppl.inference.series.states import same
 from bcppl.traces import Series, extend, generate
 from tests.inference.series.linear_series import (
     AUTOREGRESSION,
@@ -181,3 +182,43 @@ def test_refusals_say_what_to_do() -> None:
         smooth([], 2)
     with pytest.raises(InputError, match="0 draws"):
         smooth(populations, 0)
+
+
+class Held:
+    """A state of a class of one's own."""
+
+    def __init__(self, x: Tensor, k: Tensor) -> None:
+        self.x, self.k, self.shared = x, k, torch.ones(3)
+
+    def __getitem__(self, index: Tensor) -> Held:
+        return Held(self.x[index], self.k[index])
+
+    def where(self, mask: Tensor, other: Held) -> Held:
+        return Held(torch.where(mask, self.x, other.x), torch.where(mask, self.k, other.k))
+
+
+def test_what_objects_of_a_state_hold_is_compared() -> None:
+    """The last observation tells k, which no step changes: paths of the other k do not lead there."""
+
+    def begin() -> Held:
+        k = pyro.sample("k", dist.Bernoulli(torch.tensor(0.5).double()))
+        return Held(pyro.sample("x", dist.Normal(torch.zeros(()).double(), 1.0)), k)
+
+    def step(state: Held, use: float) -> Held:
+        x = pyro.sample("x", dist.Normal(0.5 * state.x, 1.0))
+        pyro.sample("y", dist.Normal(6.0 * use * state.k + x, 0.5))
+        return Held(x, state.k)
+
+    torch.manual_seed(0)
+    begun = importance_sampling(Series(begin, step), (), {}, 200)
+    seen = [Observed((use,), {"y": torch.tensor(y).double()}) for y, use in ((0.0, 0.0), (6.0, 1.0))]
+    populations = [begun, *(each.population for each in steps(tempered(share=0.0), begun, seen))]
+    assert float(smooth(populations, 300)["k", 0].mean()) > 0.99
+
+
+def test_an_object_that_cannot_be_compared_is_refused() -> None:
+    class Slots:
+        __slots__ = ("x",)
+
+    with pytest.raises(InputError, match="a Slots, whose particles cannot be compared"):
+        same({"x": torch.zeros(3), "own": Slots()}, {"x": torch.zeros(3), "own": Slots()}, 3)

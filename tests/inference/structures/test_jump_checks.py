@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import partial
+from typing import Any
 
 import pyro
 import pyro.distributions as dist
@@ -12,7 +13,9 @@ import torch
 from torch import Tensor
 
 from bcppl.errors import InputError
+from bcppl.inference import importance_sampling, rejuvenate
 from bcppl.inference.filters.smcp3 import Pair, move_and_weight
+from bcppl.inference.kernels import involutive
 from bcppl.inference.population import Population
 from bcppl.inference.structures import Jump, Strata, generate_strata, jump, probabilities, resample_strata
 from bcppl.inference.targets import POSTERIOR
@@ -128,3 +131,27 @@ def test_a_jump_in_single_precision_undoes_itself_to_rounding(centre: float) -> 
         )
     )
     assert min(move(strata, POSTERIOR).acceptance) > 0.05
+
+
+@pytest.mark.parametrize("kind", [torch.float32, torch.float64])
+def test_a_map_that_stretches_is_right_in_single_precision_too(kind: torch.dtype) -> None:
+    one = torch.ones((), dtype=kind)
+
+    def weighed() -> None:
+        x = pyro.sample("x", dist.Gamma(2.0 * one, one))
+        pyro.sample("y", dist.Normal(x, 1.0))
+
+    def choose(trace: Trace) -> None:
+        pyro.sample("u", dist.Beta(2.0 * one, 2.0 * one))
+
+    def odds(values: Any, choices: Any) -> Any:
+        return {"x": choices["u"] / (1.0 - choices["u"])}, {"u": values["x"] / (1.0 + values["x"])}
+
+    def wrong(values: Any, choices: Any) -> Any:
+        return {"x": choices["u"] / (1.0 - choices["u"]).detach()}, {"u": values["x"] / (1.0 + values["x"])}
+
+    torch.manual_seed(0)
+    population = importance_sampling(weighed, (), {"y": one}, 4000)
+    rejuvenate(population, involutive(choose, odds, check=True))
+    with pytest.raises(InputError, match="they have to cancel"):
+        rejuvenate(population, involutive(choose, wrong, check=True))

@@ -384,3 +384,18 @@ def test_a_structural_value_that_is_observed_names_its_stratum() -> None:
     extended = extend_strata(generate_strata(program, (0,), {}, 50), Observed((1,), {"s_0": number(1.0)}))
     assert [dict(s) for s in extended.structures] == [{"a": 0, "s_0": 1}, {"a": 1, "s_0": 1}]
     assert probabilities(extended, "s_0").probabilities.tolist() == pytest.approx([1.0])
+
+
+def test_means_are_of_what_all_structures_have() -> None:
+    def program() -> None:
+        more = structural("more", dist.Bernoulli(torch.tensor(0.5)))
+        x = pyro.sample("x", dist.Normal(torch.tensor(0.0), 1.0))
+        pyro.deterministic("double", 2.0 * x)
+        if more:
+            pyro.sample("z", dist.Normal(x, 1.0))
+
+    strata = generate_strata(program, (), {}, particles=40)
+    torch.testing.assert_close(mean(strata, "double"), 2.0 * mean(strata, "x"))
+    for address in ("nope", "z"):
+        with pytest.raises(InputError, match=repr(address)):
+            mean(strata, address)
