@@ -167,6 +167,19 @@ def test_a_probe_that_begins_in_contact_is_named_and_nothing_else() -> None:
     assert "probe 'up' has a force of" in found and "probably it begins in contact" in found
 
 
+def test_a_peg_that_is_where_two_sources_say_jumps() -> None:
+    recording, measured = right(3, False), []
+    for each in recording.measurements:
+        if each.kind == "window":
+            pose = each.observation.world_from_peg.copy()
+            pose[::2, 0] += 0.05
+            each = replace(each, observation=replace(each.observation, world_from_peg=pose))
+        measured.append(each)
+    (found,) = doubts(replace(recording, measurements=measured))
+    assert_one_sentence(found)
+    assert "a peg that jumps" in found and "mm within 10 ms: probably two sources" in found
+
+
 def test_a_frame_whose_z_axis_points_to_the_pegs_tip_is_doubted_by_check_and_planners() -> None:
     recording = right(3, False)
     turned = recording.peg.moved([0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0])

@@ -21,7 +21,7 @@ from bcppl.sensors.plausibility.images import reordered
 from bcppl.sensors.plausibility.pegs import peg_doubt
 from bcppl.sensors.plausibility.search import Found, is_narrow
 from bcppl.sensors.plausibility.torques import torque_doubt
-from bcppl.sensors.plausibility.units import FEWEST, command_doubt, in_newtons, zero_doubt
+from bcppl.sensors.plausibility.units import FEWEST, command_doubt, in_newtons, jump_doubt, zero_doubt
 from bcppl.sensors.plausibility.wording import of_probes
 
 TOUCHING = 0.004  # m: gaps up to which a felt contact is one with the part
@@ -83,11 +83,12 @@ def touch_doubts(
     touching = []
     for felt in probes:
         in_units, causes = in_newtons(felt, peg)
-        tared = list(zero_doubt(in_units))
-        for cause in [*causes, *tared, *command_doubt(felt)]:
+        # By a wrench that is tared in contact, where the peg is free it seems to touch; a peg that jumps is
+        # nowhere.
+        astray = [*zero_doubt(in_units), *jump_doubt(felt)]
+        for cause in [*causes, *astray, *command_doubt(felt)]:
             by_cause.setdefault(cause, []).append(felt.probe.name)
-        # By a wrench that is tared in contact, where the peg is free it seems to touch.
-        if not tared and in_units.contact.sum() >= FEWEST:
+        if not astray and in_units.contact.sum() >= FEWEST:
             touching.append(in_units)
     lines = [*peg_doubt(peg), *(f"{of_probes(names)} has {cause}." for cause, names in by_cause.items())]
     if touching and is_narrow(guess):

@@ -13,6 +13,7 @@ from bcppl.sensors.plausibility.contacts import LEAST, ZERO, Felt
 FAINTEST, STRONGEST = 0.3, 1000.0  # N: the largest force of a probe that meets something is between
 CLEAR = 20.0  # times the noise: a contact, whatever the unit
 LONGEST, SHORTEST = 10.0, 0.002  # reaches of the peg: the median lever of its contacts is between
+FASTEST = 3.0  # m/s of a peg that an arm moves
 STILL, MOVED = 0.001, 0.005  # m: a command that stands still, a peg that moves
 LEFT = 0.005  # m from where it began: the peg has left, and retreats over as much again
 STEADY = 0.3  # of a force: by so much it may vary
@@ -100,4 +101,17 @@ def command_doubt(felt: Felt) -> Iterator[str]:
         yield (
             f"a command that never changes, while the peg moves by {1e3 * moved:.0f} mm: give the commanded "
             "poses, or the measured ones where the controller states none"
+        )
+
+
+def jump_doubt(felt: Felt) -> Iterator[str]:
+    """The mistake in words where the peg is measured to move faster than an arm does."""
+    steps = np.linalg.norm(np.diff(felt.pose[:, :3], axis=0), axis=1)
+    seconds = np.diff(felt.times)
+    jumps = steps > FASTEST * seconds
+    if jumps.any():
+        farthest = int(np.where(jumps, steps, 0.0).argmax())
+        yield (
+            f"a peg that jumps {int(jumps.sum())} times, by {1e3 * steps[farthest]:.0f} mm within "
+            f"{1e3 * seconds[farthest]:.0f} ms: probably two sources of one pose, or stamps that are wrong"
         )
