@@ -156,6 +156,21 @@ def test_slower_transforms_are_interpolated_and_their_gaps_left_out(tmp_path: Pa
     assert not gap.any() and "left out, for a slower transform is not known there" in notes[1]
 
 
+def test_a_draft_names_the_frames_that_a_bag_has(tmp_path: Path) -> None:
+    def rows(types: bag_logs.Types) -> Any:
+        still = types("geometry_msgs/Quaternion", 0.0, 0.0, 0.0, 1.0)
+        moved = types("geometry_msgs/Transform", types("geometry_msgs/Vector3", 0.1, 0.0, 0.0), still)
+        for k in range(50):
+            each = types("geometry_msgs/TransformStamped", types.header(0.01 * k, "base_link"), "tip", moved)
+            yield 0.01 * k, "/tf", "tf2_msgs/TFMessage", types("tf2_msgs/TFMessage", [each])
+
+    new = tmp_path / "new.yaml"
+    with pytest.raises(typer.Exit):
+        bag.command(bag_logs.write(tmp_path / "two", "sqlite3", rows), write=new)
+    text = new.read_text()
+    assert "parent: base_link  # a guess" in text and "child: tip" in text
+
+
 def test_joints_are_found_by_their_names(tmp_path: Path, config: Path) -> None:
     urdf, tip = Path(__file__).parents[3] / "models/robots/panda/panda.urdf", "panda_hand_tcp"
     robot = Robot(urdf, tip=tip)

@@ -68,6 +68,7 @@ def test_a_window_of_an_exr_image_is_refused(tmp_path: Path) -> None:
         ("t,x\n2025-01-09T13:59:54,1\n2025-01-09T13:59:55,1\n", "write times as numbers"),
         ("t,x\ns,N\n0.5,1\n0.6,2\n", "take out the line below the names, if it holds units"),
         ("t,x\n0.5,\n0.6,2\n", "write nan where nothing was measured"),
+        ("t,x\n0.5,1\n0.6,2\n0.7", "line 3 of the numbers ends after 1, as where a log is cut off"),
     ],
 )
 def test_what_is_no_number_is_named_by_its_shape(text: str, words: str, tmp_path: Path) -> None:

@@ -122,13 +122,13 @@ def _frames(bag: Bag) -> tuple[str, str]:
         for _, message in zip(range(_LOOKED_AT), bag.messages([topic.name]), strict=False):
             for each in bag.parsed(message).transforms:
                 above[each.child_frame_id.lstrip("/")] = each.header.frame_id.lstrip("/")
-    longest: list[str] = ["base", "tool0"]
+    longest: list[str] = []
     for leaf in sorted(set(above) - set(above.values())):
         way = [leaf]
         while way[-1] in above and above[way[-1]] not in way:
             way.append(above[way[-1]])
         longest = max(longest, way[::-1], key=len)
-    return longest[0], longest[-1]
+    return (longest[0], longest[-1]) if longest else ("base", "tool0")
 
 
 def _nearest(topic: str, others: list[str]) -> str | None:

@@ -19,6 +19,7 @@ from bcppl.recordings.hdf5 import one_line
 
 Names = Sequence[str | int]
 _ELEMENT = re.compile(r"(.+)\[(\d+)\]")  # a column of an array (T, C): "wrench[3]"
+_FEW_FIELDS = re.compile(r"invalid column index \d+ at row (\d+) with (\d+) columns")
 _NO_NUMBER = re.compile(r"string '(.*)' to float64 at row (\d+)")
 _DELIMITERS = (",", ";", "\t")
 _BEFORE_NAMES = 20  # lines of comments at most
@@ -95,6 +96,8 @@ def _counts(cells: Sequence[str]) -> set[int]:
 
 def _remedy(cause: str) -> str:
     """What to do about text that numpy's reader names as no number."""
+    if short := _FEW_FIELDS.search(cause):
+        return f"line {short[1]} of the numbers ends after {short[2]}, as where a log is cut off: remove it"
     found = _NO_NUMBER.search(cause)
     text, row = (found[1].strip(), found[2]) if found else ("", "")
     if re.fullmatch(r"[-+]?\d*,\d+([eE][-+]?\d+)?", text):
