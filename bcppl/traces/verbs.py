@@ -25,6 +25,7 @@ from bcppl.traces.series import Series, SeriesTrace, Stage, runnable
 from bcppl.traces.trace import Trace, refuse_masked_latents
 from bcppl.traces.values import Value, held, shapes, tensors
 
+WEIGHTED = ("extend", "update")  # verbs in whose place `bcppl.inference` has one for populations
 # A vector that was meant as one event is unlikely to have more entries.
 FEW = 20
 
@@ -33,7 +34,8 @@ def refuse_no_trace(where: str, given: Any) -> None:
     """Refuse what is no trace."""
     if not isinstance(given, Trace):
         own = "; give its `.trace`" if hasattr(given, "trace") else ""
-        raise InputError(f"{where} is given a {type(given).__name__} in place of a trace{own}.")
+        also = ", or weigh all by bcppl.inference.update" if own and where in WEIGHTED else ""
+        raise InputError(f"{where} is given a {type(given).__name__} in place of a trace{own}{also}.")
 
 
 def simulate(program: Program | Series, args: tuple[Any, ...] = (), particles: int = 1) -> Trace:

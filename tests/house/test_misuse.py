@@ -135,7 +135,7 @@ MISUSES: dict[str, tuple[Callable[[], Any], str]] = {
     ),
     "a population for the verbs of traces": (
         lambda: extend(start(), (1,), {"y_0": 0.4}),  # type: ignore[arg-type]
-        "extend is given a Population in place of a trace; .* bcppl.inference.extend",
+        r"extend is given a Population in place of a trace; give its `.trace`, or .* bcppl.inference.update",
     ),
     "a trace to enlarge": (lambda: resize(start().trace, 30), "resize is given a Trace"),  # type: ignore[arg-type]
     "a trace to copy": (lambda: replicate(start().trace, 2), "replicate is given a Trace"),  # type: ignore[arg-type]
