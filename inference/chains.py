@@ -28,7 +28,7 @@ from torch import Tensor
 
 from bcppl.arguments import latent_address, whole_number
 from bcppl.inference.kernels import Kernel, fitted, moved_by
-from bcppl.inference.kernels.halving import together
+from bcppl.inference.kernels.halving import moved_together
 from bcppl.inference.kernels.kernel import learns, refuse_no_kernel, scattered
 from bcppl.inference.population import Population, refuse_no_population
 from bcppl.inference.progress import watched
@@ -113,7 +113,7 @@ def markov_chains(
     recorded = list(trace.choices if addresses is None else addresses)
     for address in recorded:
         latent_address("chains are to record {}", address, trace.choices)
-    population, parts = together(population, learning=learns(kernel))
+    population, parts = moved_together(population, learning=learns(kernel))
     moves_of = [fitted(kernel, population[other]) for other in parts[::-1]]
     taken = torch.zeros(count, dtype=torch.float64)
     draws: dict[str, list[Tensor]] = {address: [] for address in recorded}

@@ -40,7 +40,7 @@ def approximated(population: Population) -> Callable[[Trace], Tensor]:
     return lambda trace: _cheap_log_density(trace, approximation)
 
 
-marked(approximated, learns=False)
+marked(approximated, reversible=False, learns=False)
 
 
 def screened(

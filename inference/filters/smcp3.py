@@ -34,7 +34,7 @@ from torch import Tensor
 from bcppl.errors import InputError
 from bcppl.inference.filters.conditioned_backward import log_conditioned
 from bcppl.inference.filters.step import Observed, StepFunction, StepInfo, Stepped
-from bcppl.inference.kernels.halving import together
+from bcppl.inference.kernels.halving import moved_together
 from bcppl.inference.kernels.jacobian import (
     Key,
     charted,
@@ -113,7 +113,7 @@ def move_and_weight(
     """
     count = len(population)
     learns = isinstance(pair.forward, Fittable) or isinstance(pair.backward, Fittable)
-    population, parts = together(population, learning=learns)
+    population, parts = moved_together(population, learning=learns)
     log_factor = torch.zeros(count, dtype=torch.float64)
     whole: Trace | None = None
     for k, mine in enumerate(parts):

@@ -35,7 +35,7 @@ def halves(population: Population) -> list[Tensor]:
     return [part for part in parts if len(part)]
 
 
-def together(population: Population, *, learning: bool) -> tuple[Population, list[Tensor]]:
+def moved_together(population: Population, *, learning: bool) -> tuple[Population, list[Tensor]]:
     """A population, and the indices (K,) of the particles that are moved together.
 
     They are its halves where moves learn from particles, for which it is split, and else all.

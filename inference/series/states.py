@@ -15,7 +15,7 @@ from bcppl.traces.carried import Entry
 from bcppl.traces.indexing import broadcast
 
 # What particles cannot differ in.
-_SHARED = (bool, int, float, complex, str, bytes, type(None))
+_SHARED = (bool, int, float, complex, str, bytes, type(None), np.generic)
 
 
 def merged(mask: Tensor, first: Any, second: Any) -> Any:
@@ -83,6 +83,8 @@ def same(first: Any, second: Any, particles: int) -> Tensor:
         return equal
     elif hasattr(first, "__dict__"):
         parts = [same(value, vars(second)[name], particles) for name, value in vars(first).items()]
+    elif not hasattr(first, "__getitem__"):
+        return equal  # what cannot be indexed is of no particle
     else:
         raise InputError(
             f"a series' state holds a {type(first).__name__}, whose particles cannot be compared with those "

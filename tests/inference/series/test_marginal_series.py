@@ -16,8 +16,6 @@ from bcppl.inference import (
     Observed,
     importance_sampling,
     markov_chains,
-    rejuvenate,
-    resample,
     steps,
     tempered,
 )
@@ -29,8 +27,7 @@ from bcppl.inference.series import marginal
 from bcppl.inference.series.nested import Filters
 from bcppl.inference.summaries import mean
 from bcppl.inference.targets import POSTERIOR
-from bcppl.traces import Series, Trace, assess, extend, generate, gradients, simulate, update
-from bcppl.traces.carried import carried
+from bcppl.traces import Series, Trace, assess, generate, gradients, simulate, update
 from tests.inference.series.linear_series import (
     AUTOREGRESSION,
     NOISE,
@@ -217,54 +214,6 @@ def test_increments_may_be_tempered_and_evidence_is_kept_by_windows() -> None:
         torch.testing.assert_close(population.trace.log_prob(*names), total, rtol=0, atol=1e-12)
 
 
-def test_a_simulator_that_a_step_carries_goes_on_in_its_filter() -> None:
-    """It is begun once for each of the M x N particles, and follows them through all choices and merges."""
-    begun: list[int] = []
-
-    class Counter:
-        """The pose that a simulator was begun for, and how many steps it has made."""
-
-        def __init__(self, owner: Tensor, steps: Tensor) -> None:
-            self.owner, self.steps = owner, steps
-
-        def __getitem__(self, index: Tensor) -> Counter:
-            return Counter(self.owner[index], self.steps[index])
-
-        def where(self, mask: Tensor, other: Counter) -> Counter:
-            pairs = ((self.owner, other.owner), (self.steps, other.steps))
-            return Counter(*(torch.where(mask, a, b) for a, b in pairs))
-
-    def begin() -> dict[str, Tensor]:
-        return {"pose": pyro.sample("pose", dist.Normal(number(0.0), 1.0))}
-
-    def probe(state: dict[str, Tensor]) -> dict[str, Tensor]:
-        pose = state["pose"]
-
-        def start() -> Counter:
-            begun.append(len(pose))
-            return Counter(pose, torch.zeros_like(pose))
-
-        counter = carried("probe", start)
-        assert torch.equal(counter.owner, pose)
-        counter.steps += 1.0
-        x = pyro.sample("x", dist.Normal(pose, 1.0))
-        pyro.sample("y", dist.Normal(x, 0.5))
-        return {"pose": pose, "steps": counter.steps.clone()}
-
-    torch.manual_seed(0)
-    program = marginal(Series(begin, probe), "pose", observed="y", particles=6, threshold=1.0)
-    trace, _ = generate(program, ([()] * 3,), observed(3), 4)
-    # The shape of an observation is read from one run of its own.
-    assert begun == [1, 24]
-    moved = update(trace, {"pose": trace["pose"] + 0.1}).trace
-    moved.log_prob()
-    mixed = moved.where(torch.tensor([True, False, True, False]), trace)[torch.tensor([3, 0, 0, 1])]
-    before = len(begun)
-    longer, _ = extend(mixed, ([()] * 4,), {"y/4": SEEN[3]})
-    filters = longer.distributions["y/4"].filters
-    assert len(begun) == before and bool((filters.state["steps"] == 4.0).all())
-
-
 def in_a_plate() -> dict[str, Tensor]:
     scale = pyro.sample("scale", dist.LogNormal(number(0.0), 0.3))
     with pyro.plate("sites", 2):
@@ -400,26 +349,3 @@ def test_a_number_of_steps_is_no_list_of_them() -> None:
     for given in (3, [1, 2]):
         with pytest.raises(InputError, match=r"give a list of the arguments of each step"):
             generate(program, (given,), {}, 5)
-
-
-@pytest.mark.parametrize("entries", [40, 41])
-def test_an_argument_with_as_many_entries_as_there_are_particles_is_no_particle_s_own(entries: int) -> None:
-    """Filters go on where particles are resampled and moved, whatever the size of `init`'s arguments."""
-
-    def begin(scales: Tensor) -> dict[str, Tensor]:
-        rho = pyro.sample("rho", dist.Uniform(-1.0, 1.0))
-        return {"rho": rho, "x": pyro.sample("x", dist.Normal(0.0, scales.mean()))}
-
-    def step(state: dict[str, Tensor]) -> dict[str, Tensor]:
-        x = pyro.sample("x", dist.Normal(state["rho"] * state["x"], 1.0))
-        pyro.sample("y", dist.Normal(x, 0.3))
-        return {"rho": state["rho"], "x": x}
-
-    torch.manual_seed(0)
-    program, scales = marginal(Series(begin, step), "rho", observed="y", particles=5), torch.ones(entries)
-    seen = {f"y/{t}": torch.tensor(y) for t, y in enumerate((1.5, 1.2, 2.0, 1.0, 2.5), 1)}
-    population = resample(importance_sampling(program, ([()] * 5, scales), seen, 40))
-    trace = rejuvenate(population, metropolis_hastings(drift("rho"))).trace
-    longer, _ = extend(trace, ([()] * 6, scales), {"y/6": torch.tensor(2.0)})
-    known = torch.stack([longer.log_prob(address) for address in seen])
-    assert torch.equal(longer.distributions["y/6"].filters.increments[:5], known)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,6 @@ from bcppl.recordings import load, problems
 from bcppl.recordings.importers import Imported, bag, bench
 from bcppl.recordings.importers.bag.bag_log import BagLog
 from bcppl.recordings.importers.bag.reading import Bag
-from bcppl.recordings.importers.bench.configuration.drafts import spelled
 from bcppl.recordings.importers.bench.configuration.reading import read_configuration
 from bcppl.recordings.importers.bench.pose_columns import read_joints
 from bcppl.robot.kinematics import Robot
@@ -154,21 +152,6 @@ def test_slower_transforms_are_interpolated_and_their_gaps_left_out(tmp_path: Pa
     np.testing.assert_allclose(table[:, 2], 2.5 * table[:, 0], atol=1e-9)  # of a forward and a backward one
     gap = (table[:, 0] > 14.005) & (table[:, 0] < 14.995)
     assert not gap.any() and "left out, for a slower transform is not known there" in notes[1]
-
-
-def test_a_draft_names_the_frames_that_a_bag_has(tmp_path: Path) -> None:
-    def rows(types: bag_logs.Types) -> Any:
-        still = types("geometry_msgs/Quaternion", 0.0, 0.0, 0.0, 1.0)
-        moved = types("geometry_msgs/Transform", types("geometry_msgs/Vector3", 0.1, 0.0, 0.0), still)
-        for k in range(50):
-            each = types("geometry_msgs/TransformStamped", types.header(0.01 * k, "base_link"), "tip", moved)
-            yield 0.01 * k, "/tf", "tf2_msgs/TFMessage", types("tf2_msgs/TFMessage", [each])
-
-    new = tmp_path / "new.yaml"
-    with pytest.raises(typer.Exit):
-        bag.command(bag_logs.write(tmp_path / "two", "sqlite3", rows), write=new)
-    text = new.read_text()
-    assert "parent: base_link  # a guess" in text and "child: tip" in text
 
 
 def test_joints_are_found_by_their_names(tmp_path: Path, config: Path) -> None:
@@ -337,50 +320,6 @@ def test_no_definition_of_a_bag_is_compiled(tmp_path: Path, monkeypatch: pytest.
     with Bag(path) as opened, pytest.raises(InputError, match="of another definition"):
         opened.topic("pose", "/pose", ["geometry_msgs/msg/PoseStamped"])
     assert registered == ["tf2_msgs/msg/TFMessage"]
-
-
-def test_a_name_in_a_bag_is_no_line_of_the_drafted_configuration(tmp_path: Path) -> None:
-    frame = "base\nsource: 'injected'\n#"
-
-    def rows(types: bag_logs.Types) -> Iterator[bag_logs.Row]:
-        zero = types("geometry_msgs/Vector3", 0.0, 0.0, 0.0)
-        for stamp in (0.0, 0.1):
-            wrench = types("geometry_msgs/Wrench", zero, zero)
-            stamped = types("geometry_msgs/WrenchStamped", types.header(stamp, frame), wrench)
-            yield stamp, "/wrench", "geometry_msgs/WrenchStamped", stamped
-
-    path, new = bag_logs.write(tmp_path / "bag", "mcap", rows), tmp_path / "new.yaml"
-    with pytest.raises(typer.Exit):
-        bag.command(path, write=new)
-    text = new.read_text()
-    assert "source" not in yaml.safe_load(text)
-    assert r'in the frame "base\nsource' in text
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        "/wrench",
-        "side 1",
-        "a: b",
-        "x\ny",
-        "2025-31-01",
-        "1.5",
-        "",
-        "~",
-        "it's",
-        "é",
-        "\u202ex",
-        "a,b]",
-        "&a",
-        "'",
-    ],
-)
-def test_a_name_is_spelled_so_that_yaml_reads_it(name: str) -> None:
-    text = spelled(name)
-    assert text.isprintable() and (text == name or not re.fullmatch("[a-z/_]+", name))
-    assert yaml.safe_load(f"{{topic: {text}, every: 2}}  # a guess, {text}") == {"topic": name, "every": 2}
-    assert yaml.safe_load(f"camera:\n  {text}:  # a guess\n    1") == {"camera": {name: 1}}
 
 
 def test_without_a_configuration_one_is_drafted(
