@@ -154,18 +154,19 @@ def test_a_measurement_that_nothing_explains_is_left_out_or_ends_it(touched: Rec
 
 
 def test_arrays_of_measurements_may_be_used_again(touched: Recording) -> None:
-    first, empty, beliefs = touched.measurements[0], replace(touched, measurements=[]), []
-    for spoiled in (False, True):
-        with Filter(model, empty, particles=FEW, deadline=1e3) as live:
-            held = threading.Event()
-            live._thread.submit(held.wait)  # the filter is busy when it arrives
-            observation = deepcopy(first.observation)
-            live.observe(first.action, observation)
-            if spoiled:
-                observation.wrench[:] = 7.0
-            held.set()
-            beliefs.append(live.settle().belief)
-    assert torch.equal(beliefs[0].world_from_part, beliefs[1].world_from_part)
+    with Filter(model, replace(touched, measurements=[]), particles=FEW, deadline=1e3) as live:
+        held = threading.Event()
+        live._thread.submit(held.wait)  # the filter is busy when they arrive
+        for each in touched.measurements:
+            observation = deepcopy(each.observation)
+            live.observe(each.action, observation)
+            observation.wrench[:], observation.world_from_peg[:] = 7.0, 7.0
+        held.set()
+        live.settle()
+    for kept in (live.recording, live.arrived):
+        for one, other in zip(kept.measurements, touched.measurements, strict=True):
+            for name in FIELDS:
+                assert np.array_equal(getattr(one.observation, name), getattr(other.observation, name))
 
 
 def test_windows_after_one_that_is_left_out_or_overlaps_are_left_out(touched: Recording) -> None:
