@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from bcppl.geometry.camera import Camera
-from bcppl.recordings import DepthImage, Measurement, Recording, View, problems, save
+from bcppl.recordings import DepthImage, Measurement, Recording, View, load, problems, save
 from bcppl.sensors.push import PushSensor
 from tests.command_line import SHIPPED, Ran, short
 
@@ -295,6 +295,16 @@ def test_simulate_refuses(bcppl: Callable[..., Ran], tmp_path: Path) -> None:
     assert_refused(bcppl("simulate", "point_probe", "--out", "."), "is a directory")
     assert_refused(bcppl("simulate", "point_probe", "--seed", -1), "'--seed'")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_recording_without_a_name_takes_the_place_of_none(
+    bcppl: Callable[..., Ran], tmp_path: Path
+) -> None:
+    assert "wrote recording.h5" in bcppl("simulate", "point_probe").out
+    first = (tmp_path / "recording.h5").read_bytes()
+    assert "wrote recording_2.h5" in bcppl("simulate", "point_probe", "--seed", 1).out
+    assert (tmp_path / "recording.h5").read_bytes() == first
+    assert not problems(load(tmp_path / "recording_2.h5"))
 
 
 def test_as_a_program() -> None:

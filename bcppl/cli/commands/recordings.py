@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import itertools
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -22,7 +23,11 @@ if TYPE_CHECKING:
     from bcppl.recordings import Recording
     from bcppl.recordings.importers import Imported
 
-OUT = Annotated[Path, typer.Option("--out", "-o", dir_okay=False, help="The recording to write (.h5).")]
+UNNAMED = Path("recording.h5")
+OUT = Annotated[
+    Path | None,
+    typer.Option("--out", "-o", dir_okay=False, help=f"The recording to write; {UNNAMED} unless given."),
+]
 
 
 def check(
@@ -80,7 +85,7 @@ def _made(make: Callable[[Recording], list[Any]], recording: Recording, wrong: S
 
 def simulate(
     model: Annotated[str, typer.Argument(help="A model's name, or a file.")] = "peg_in_hole",
-    out: OUT = Path("recording.h5"),
+    out: OUT = None,
     seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Same seed, same recording.")] = 0,
 ) -> None:
     """Write a recording that a model's own world simulates: a true pose from the prior, and noisy sensors."""
@@ -92,6 +97,7 @@ def simulate(
             f"model {model!r} simulates no recordings; these do: {', '.join(loading.simulating())}. "
             "A model of your own does once it has a `simulate_recording(seed)`."
         )
+    out = _writable(out)
     _write(chosen.simulate_recording(seed), out)
 
 
@@ -101,19 +107,22 @@ def _write(recording: Recording, out: Path) -> None:
     from bcppl.recordings import describe, save, validate
 
     validate(recording)
-    _refuse_out(out)
     save(recording, out)
     written = f"wrote {out}: {dict(describe(recording))['measurements']}"
     Console().print(visible(written), highlight=False, markup=False)
 
 
-def _refuse_out(out: Path, *read: Path) -> None:
-    """Refuse to write a recording over what is read, or over what is none, such as a log."""
+def _writable(out: Path | None, *read: Path) -> Path:
+    """Where to write a recording: not over what is read or is none, such as a log, nor over one unasked."""
     import h5py
 
+    if out is None:
+        others = (UNNAMED.with_stem(f"{UNNAMED.stem}_{number}") for number in itertools.count(2))
+        out = next(name for name in itertools.chain([UNNAMED], others) if not name.exists())
     refuse_overwriting("--out", out, *read)
     if out.is_file() and out.stat().st_size and not h5py.is_hdf5(out):
         raise InputError(f"--out would overwrite {out}, which is no recording; give another name.")
+    return out
 
 
 class Importers(TyperGroup):
@@ -150,12 +159,12 @@ def _importing(command: Callable[..., Recording | Imported]) -> Callable[..., No
     """
 
     @functools.wraps(command)
-    def importing(*, out: Path, **options: Any) -> None:
+    def importing(*, out: Path | None, **options: Any) -> None:
         from rich.console import Console
 
         from bcppl.recordings.importers import Imported
 
-        _refuse_out(out, *(each for each in options.values() if isinstance(each, Path)))
+        out = _writable(out, *(each for each in options.values() if isinstance(each, Path)))
         made = command(**options)
         imported = made if isinstance(made, Imported) else Imported(made)
         for line in imported.report:
@@ -164,9 +173,7 @@ def _importing(command: Callable[..., Recording | Imported]) -> Callable[..., No
 
     wrapped: Any = importing
     signature = inspect.signature(command)
-    added = inspect.Parameter(
-        "out", inspect.Parameter.KEYWORD_ONLY, annotation=OUT, default=Path("recording.h5")
-    )
+    added = inspect.Parameter("out", inspect.Parameter.KEYWORD_ONLY, annotation=OUT, default=None)
     parameters = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in signature.parameters.values()]
     wrapped.__signature__ = signature.replace(parameters=[*parameters, added], return_annotation=None)
     wrapped.__annotations__ = {p.name: p.annotation for p in [*parameters, added]}
