@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from typing import TYPE_CHECKING
 
 from bcppl.errors import InputError
@@ -78,6 +78,11 @@ def pose_problem(name: str, pose: Array) -> str | None:
             f"{name} has a quaternion of length {norm[wrong].flat[0]:.4g}; give qw qx qy qz of unit length."
         )
     return None
+
+
+def address_list(addresses: str | Iterable[str]) -> list[str]:
+    """Addresses where one may be given as it is: a word is one address, and not its letters."""
+    return [addresses] if isinstance(addresses, str) else list(addresses)
 
 
 def latent_address(what: str, address: str, latent: Collection[str]) -> None:

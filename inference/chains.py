@@ -26,7 +26,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from bcppl.arguments import latent_address, whole_number
+from bcppl.arguments import address_list, latent_address, whole_number
 from bcppl.inference.kernels import Kernel, fitted, moved_by
 from bcppl.inference.kernels.halving import moved_together
 from bcppl.inference.kernels.kernel import learns, refuse_no_kernel, scattered
@@ -109,8 +109,7 @@ def markov_chains(
     if warm_up:
         population = moved_by(population, kernel, target, warm_up).population
     trace, count = population.trace, len(population)
-    addresses = [addresses] if isinstance(addresses, str) else addresses
-    recorded = list(trace.choices if addresses is None else addresses)
+    recorded = address_list(trace.choices if addresses is None else addresses)
     for address in recorded:
         latent_address("chains are to record {}", address, trace.choices)
     population, parts = moved_together(population, learning=learns(kernel))

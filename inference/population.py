@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, overload
 import torch
 from torch import Tensor
 
-from bcppl.arguments import latent_address
+from bcppl.arguments import address_list, latent_address
 from bcppl.beliefs import Belief, normalised
 from bcppl.beliefs.belief import ApparentPose, SeesPart
 from bcppl.cached import cached_property
@@ -94,11 +94,12 @@ class Population:
         """How many particles with weight differ in some latent value; 1 of a program without any."""
         return self.distinct_in(self.trace.choices)
 
-    def distinct_in(self, addresses: Collection[str]) -> int:
-        """The same of some latent addresses."""
+    def distinct_in(self, addresses: str | Collection[str]) -> int:
+        """The same of one or some latent addresses."""
+        asked = address_list(addresses)
         alive = self.log_weights > -torch.inf
         count = int(alive.sum())
-        values = [value for address, value in self.trace.choices.items() if address in addresses]
+        values = [value for address, value in self.trace.choices.items() if address in asked]
         columns = [value[alive].reshape(count, value[0].numel()).double() for value in values]
         columns = [column for column in columns if column.shape[1]]
         # Where one number tells all apart, as a continuous one does unless particles are copies: rows take

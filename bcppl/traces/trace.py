@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from bcppl.arguments import address_list
 from bcppl.cached import cached_property
 from bcppl.distributions.support import Support, support_of
 from bcppl.errors import InputError
@@ -250,13 +251,13 @@ class Trace:
             hidden=self.hidden | source.hidden,
         )
 
-    def hiding(self, addresses: Iterable[str]) -> Trace:
+    def hiding(self, addresses: str | Iterable[str]) -> Trace:
         """The same trace for a proposal to read, with some sites hidden.
 
         Asking for the distribution or the log-probability of a hidden site, also after indexing or new
         values, raises an error that names the address. Values stay readable.
         """
-        hidden = frozenset(addresses)
+        hidden = frozenset(address_list(addresses))
         self._run.refuse_unvisited(hidden)
         secret = self._like(known=dict(self.known), hidden=self.hidden | hidden)
         secret._keep_run(self._ran)

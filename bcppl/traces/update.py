@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from bcppl.arguments import address_list
 from bcppl.cached import cached_property
 from bcppl.errors import InputError
 from bcppl.traces.dependence.changes import changed
@@ -184,5 +185,5 @@ def regenerate(trace: Trace, addresses: str | Collection[str]) -> Regenerated:
         InputError: an address is not latent, or the values change which addresses are visited.
     """
     refuse_no_trace("regenerate", trace)
-    addresses = [addresses] if isinstance(addresses, str) else list(addresses)
+    addresses = address_list(addresses)
     return Regenerated(trace.regenerated(addresses), trace, {a: trace.choices[a] for a in addresses})

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from bcppl.arguments import latent_address, number_within, whole_number
+from bcppl.arguments import address_list, latent_address, number_within, whole_number
 from bcppl.errors import InputError
 from bcppl.inference.chains import Chains
 from bcppl.inference.kernels.kernel import Kernel, Move, fitted, refuse_no_kernel, scattered
@@ -50,7 +50,7 @@ def replica_exchange(
     exponents: Sequence[float],
     *,
     warm_up: int = 0,
-    addresses: Collection[str] | None = None,
+    addresses: Collection[str] | str | None = None,
     progress: bool = True,
 ) -> Replicas:
     """Run C chains at each of K exponents of the likelihood, and exchange the states of neighbours.
@@ -66,7 +66,7 @@ def replica_exchange(
         exponents: of all sites that are not latent, increasing, the last 1; 0 is the prior.
         warm_up: moves that are not recorded; the kernel is fitted again after the 1st, 2nd, 4th, 8th, ...
             and the last.
-        addresses: the latent addresses to record; by default all.
+        addresses: the latent addresses to record, or one; by default all.
         progress: show a bar, on a terminal or in a notebook.
 
     Raises:
@@ -88,7 +88,7 @@ def replica_exchange(
             f"{start.particles} particles are to be replicas at {len(ladder)} exponents; "
             "give a multiple of the number of exponents."
         )
-    recorded = list(start.choices if addresses is None else addresses)
+    recorded = address_list(start.choices if addresses is None else addresses)
     for address in recorded:
         latent_address("replicas are to record {}", address, start.choices)
     run = _Run(start, ladder, count)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
+from bcppl.arguments import address_list
 from bcppl.distributions.support import freedom_of
 from bcppl.errors import InputError
 from bcppl.poses import Freedom
@@ -68,7 +69,7 @@ class Joint:
     Attributes:
         program: samples every site itself. A series is called by a program that runs its steps.
         args: its arguments.
-        observed: the addresses of the data; all others are latent.
+        observed: the addresses of the data, or one; all others are latent.
         quantities: further test quantities by name, each a function of the latent values (K, *event) by
             address and of the data that gives numbers (K,).
 
@@ -78,13 +79,11 @@ class Joint:
 
     program: Program
     args: tuple[Any, ...]
-    observed: tuple[str, ...]
+    observed: Sequence[str]
     quantities: Mapping[str, Quantity] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if isinstance(self.observed, str):
-            raise InputError(f"observed addresses are given as {self.observed!r}; give a list of them.")
-        object.__setattr__(self, "observed", tuple(self.observed))
+        object.__setattr__(self, "observed", tuple(address_list(self.observed)))
         with torch.random.fork_rng(devices=[]):
             ran = run(self.program, self.args, 1, {}, {}, draws_lazy=False)
         ran.refuse_unvisited(self.observed)

@@ -59,7 +59,7 @@ def check_kernel(
     kernel: Kernel,
     program: Program,
     args: tuple[Any, ...] = (),
-    observed: Sequence[str] = (),
+    observed: Sequence[str] | str = (),
     draws: int = 10_000,
     moves: int = 3,
     seed: int = 0,
@@ -83,7 +83,7 @@ def check_kernel(
         kernel: of this program's latent addresses.
         program: samples every site itself.
         args: its arguments.
-        observed: the addresses of the data.
+        observed: the addresses of the data, or one.
         draws: of the joint, 100 or more.
         moves: by which each is moved.
         seed: of the draws and the moves; another one gives a second opinion.
@@ -95,7 +95,7 @@ def check_kernel(
     """
     whole_number("a kernel is to be checked with {} draws", draws, least=100)
     whole_number("a kernel is to be checked by {} moves", moves)
-    data = Joint(program, args, tuple(observed)).observed
+    data = Joint(program, args, observed).observed
     seed = whole_number("a kernel is to be checked with the seed {}", seed, least=0)
     with undisturbed(seed):
         taught = simulate(program, args, TAUGHT)

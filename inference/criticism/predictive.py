@@ -32,7 +32,7 @@ import pyro.distributions as dist
 import torch
 from torch import Tensor
 
-from bcppl.arguments import whole_number
+from bcppl.arguments import address_list, whole_number
 from bcppl.devices import HOST, on_host
 from bcppl.distributions.checks import Check, Checked, chi_square
 from bcppl.distributions.poses import NormalPose
@@ -49,7 +49,7 @@ REPLICAS = 10  # images for each particle
 
 def surprise(
     population: Population,
-    addresses: Collection[str] | None = None,
+    addresses: Collection[str] | str | None = None,
     *,
     particles: int = PARTICLES,
     replicas: int = REPLICAS,
@@ -75,7 +75,7 @@ def surprise(
 
     Args:
         population: the particles.
-        addresses: those to be checked; all of the trace unless given. Others are left out silently.
+        addresses: those to be checked, or one; all of the trace unless given. Others are left out silently.
         particles: of the population, drawn by weight, at which it is checked.
         replicas: images drawn for each of them.
         seed: same seed, same p values.
@@ -89,7 +89,8 @@ def surprise(
     trace = population.trace
     if isinstance(trace, SeriesTrace):
         return {}
-    wanted = [a for a in trace.addresses if a in trace and (addresses is None or a in addresses)]
+    asked = address_list(trace.addresses if addresses is None else addresses)
+    wanted = [a for a in trace.addresses if a in trace and a in asked]
     checks: dict[str, Check] = {}
     with seeded(seed), torch.no_grad():
         chosen = systematic(population.log_weights, particles)

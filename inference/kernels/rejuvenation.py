@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from bcppl import poses
-from bcppl.arguments import number_within, whole_number
+from bcppl.arguments import address_list, number_within, whole_number
 from bcppl.beliefs import normalised
 from bcppl.devices import on_device_of
 from bcppl.distributions.support import freedom_of
@@ -65,7 +65,7 @@ def until(
     *,
     distinct: int | None = None,
     displacement: float | None = None,
-    of: Sequence[str] = (),
+    of: Sequence[str] | str = (),
     most: int = 50,
 ) -> Until:
     """Sweeps until the particles differ, or have left where they began, or both.
@@ -83,7 +83,7 @@ def until(
         displacement: the weighted mean squared displacement since the start that every axis of every
             continuous latent value shall reach, as a share of its variance in the population. It is 2 for
             independent particles, and 0.5 where the correlation with the start is about 0.75.
-        of: the addresses of the latent values that count; all unless given.
+        of: the addresses of the latent values that count, or one; all unless given.
         most: the largest number of sweeps.
 
     Raises:
@@ -96,7 +96,8 @@ def until(
     if displacement is not None:
         what = "until is to wait for a displacement of {} variances"
         displacement = number_within(what, displacement, above=0.0, below=2.0)
-    return Until(distinct, displacement, whole_number("until may make {} sweeps at most", most), tuple(of))
+    most = whole_number("until may make {} sweeps at most", most)
+    return Until(distinct, displacement, most, tuple(address_list(of)))
 
 
 def displacement(start: Population, now: Population, of: Collection[str] = ()) -> Tensor:

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bcppl.arguments import whole_number
+from bcppl.arguments import address_list, whole_number
 from bcppl.errors import InputError
 from bcppl.inference.learning.amortised import Amortised
 from bcppl.traces import Trace, assess, generate, gradients, simulate
@@ -29,7 +29,7 @@ def forward_kl(
     proposal: Amortised,
     program: Program,
     args: tuple[Any, ...] | Callable[[], tuple[Any, ...]],
-    observed: Collection[str],
+    observed: Collection[str] | str,
     *,
     batch: int = 64,
 ) -> Objective:
@@ -45,7 +45,7 @@ def forward_kl(
         proposal: samples all or some of the latent addresses.
         program: simulated forward, its observed sites included.
         args: its arguments, or a function that draws them.
-        observed: addresses that are observed when the proposal is used.
+        observed: the addresses that are observed when the proposal is used, or one.
         batch: joint draws for each evaluation.
 
     Raises:
@@ -53,18 +53,18 @@ def forward_kl(
             that is not a latent address of the program.
     """
     batch = whole_number("forward_kl is asked for batches of {} draws", batch)
-    observed, asked = list(observed), list[str]()
+    data, asked = address_list(observed), list[str]()
 
     def loss() -> Tensor:
         drawn = args() if callable(args) else args
         joint = simulate(program, drawn, batch)
-        for address in observed:
+        for address in data:
             if address not in joint:
                 raise InputError(
                     f"a proposal is to be trained on {address!r}, which the program never visits or observes "
                     f"itself; it samples {', '.join(joint.choices) or 'nothing'}."
                 )
-        seen = {address: joint[address] for address in observed}
+        seen = {address: joint[address] for address in data}
 
         def guide(_: Trace) -> None:
             proposal.guide(seen, *drawn)
