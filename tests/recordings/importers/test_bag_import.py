@@ -84,7 +84,10 @@ def assert_same(imported: Imported, expected: Imported) -> None:
 def test_a_bag_becomes_what_the_files_of_the_same_log_do(
     kind: str, bags: dict[str, Path], config: Path, by_files: Imported
 ) -> None:
-    assert_same(bag.command(bags[kind], config), by_files)
+    imported = bag.command(bags[kind], config)
+    assert_same(imported, by_files)
+    named = [line for line in imported.report if "in the frame 'base' by its messages" in line]
+    assert [line.split(":")[0] for line in named] == ["pose"]  # the wrench's messages name none
 
 
 def changed(config: Path, name: str, change: Any) -> Path:

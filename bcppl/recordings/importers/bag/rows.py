@@ -52,13 +52,14 @@ class Rows:
         self._unstamped += unstamped
 
     def rows(self) -> tuple[Array, list[str]]:
-        """Rows (T, 1 + C), and how many have the time of reception for a stamp.
+        """Rows (T, 1 + C), the frame that they name, and how many have the time of reception for a stamp.
 
         Raises:
             InputError: none was kept.
         """
         table = np.frombuffer(self._flat, dtype=np.float64).reshape(max(self._count, 1), -1)
-        return table, unstamped_words(self._unstamped, self._count)
+        frame = [f"in the frame {self._frame[:40]!r} by its messages"] if self._frame else []
+        return table, [*frame, *unstamped_words(self._unstamped, self._count)]
 
     def _keep(self, stamp: float, numbers: Sequence[float]) -> None:
         self._flat.append(stamp)

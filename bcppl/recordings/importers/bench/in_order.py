@@ -52,13 +52,21 @@ def _in_order(name: str, times: Array, values: Array) -> tuple[Stream, list[str]
                 f"{latest[row - 1]:.6f} to {times[row]:.6f} s; cut the log where its clock was set."
             )
         if repeated.any():
-            left_out.append(f"{_rows(int(repeated.sum()))} with a repeated stamp left out")
+            left_out.append(
+                f"{_rows(int(repeated.sum()))} with a repeated stamp left out{_other(values, repeated)}"
+            )
         if backwards.any():
             left_out.append(f"{_rows(int(backwards.sum()))} with a stamp before an earlier one left out")
         times, values = times[~(repeated | backwards)], values[~(repeated | backwards)]
     if len(times) < 10:
         raise InputError(f"{name} has {len(times)} usable rows; give a log of ten or more.")
     return Stream(name, times, values), left_out
+
+
+def _other(values: Array, repeated: Array) -> str:
+    """Words on repeated rows that contradict those before them."""
+    other = int((values[1:] != values[:-1]).any(axis=1)[repeated[1:]].sum())
+    return f" ({other} of other values: its clock is coarse, or it has two sources)" if other else ""
 
 
 def _described(stream: Stream) -> str:
