@@ -57,8 +57,18 @@ class Until:
         return self.displacement is None or bool((self.displaced(start, now) >= self.displacement).all())
 
     def displaced(self, start: Population, now: Population) -> Tensor:
-        """The displacement (K,) on each axis that counts, as of `displacement`."""
-        return displacement(start, now, self.of)
+        """The displacement (K,) on each axis that counts, as of `displacement`.
+
+        Raises:
+            InputError: none does, for no latent value is continuous.
+        """
+        displaced = displacement(start, now, self.of)
+        if not len(displaced):
+            raise InputError(
+                "until waits for a displacement, and none of the latent values that count is continuous; "
+                "give distinct, or a number of sweeps."
+            )
+        return displaced
 
 
 def until(
@@ -118,6 +128,27 @@ def displacement(start: Population, now: Population, of: Collection[str] = ()) -
         share = weights @ step.square() / variance
         shares.append(torch.where(variance > 0.0, share, 0.0))
     return torch.cat(shares)
+
+
+def shift(start: Population, now: Population) -> float:
+    """By how many standard errors moves have changed a mean or a variance, on the axis where that is most.
+
+    Moves that leave a target invariant change no expectation of particles that are draws of it. Copies of one
+    count as one.
+    """
+    weights, most = normalised(now.log_weights), 0.0
+    for address in now.trace.choices:
+        step, place = _coordinates(start, now, address)
+        before = place - step
+        wider = (place - weights @ place).square() - (before - weights @ before).square()
+        change = torch.cat([step, wider], dim=1)
+        mean = weights @ change
+        deviations = weights[:, None] * (change - mean)
+        _, copy = torch.unique(start.trace[address].reshape(len(now), -1), dim=0, return_inverse=True)
+        summed = torch.zeros_like(deviations).index_add_(0, copy, deviations)
+        error = summed.square().sum(dim=0).sqrt()
+        most = max(most, float((mean / error).abs().nan_to_num(0.0).max()))
+    return most
 
 
 def _coordinates(start: Population, now: Population, address: str) -> tuple[Tensor, Tensor]:

@@ -8,6 +8,7 @@ proposal, the fewer exponents; from the prior it is tempering.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -19,17 +20,25 @@ from bcppl.errors import InputError
 from bcppl.inference.filters.step import Stepped
 from bcppl.inference.filters.tempering import (
     Path,
+    Rejuvenated,
     Schedule,
     Tempered,
-    resample_move,
     share_of,
     where_left,
 )
-from bcppl.inference.kernels import Kernel, Until
+from bcppl.inference.kernels import Kernel, Until, until
 from bcppl.inference.kernels.kernel import refuse_no_kernel
+from bcppl.inference.kernels.rejuvenation import moved_by, shift
 from bcppl.inference.population import Population
-from bcppl.inference.targets import POSTERIOR
+from bcppl.inference.proposals.coordinates import continuous_addresses
+from bcppl.inference.targets import POSTERIOR, Target
 from bcppl.traces import Program, Trace, assess, generate, propose
+
+# Standard errors by which moves change a mean or a variance: below the first the particles have settled, and
+# beyond the second they were none of what was moved towards. Of 30 runs of bridges between normal densities
+# of one and six axes whose evidence is right the largest was 3.8, and 5 to 13 where it was off by nats.
+SETTLED, SHIFTED = 3.0, 5.0
+AWAY, ROUNDS = until(displacement=1.5, most=50), 10  # moves at the posterior
 
 
 @dataclass(frozen=True)
@@ -62,6 +71,10 @@ def bridged(
 ) -> Stepped:
     """Weighted particles of the posterior by SMC from a proposal, and the record of the run.
 
+    Where all particles begin well inside the posterior, their weights say nothing of what lies outside. So
+    they are moved at the posterior until that changes their means and variances no more, and a RuntimeWarning
+    states where moves did before.
+
     Args:
         program: a Pyro program.
         args: its arguments.
@@ -91,8 +104,32 @@ def bridged(
         lambda trace: trace.log_prob() - start(trace),
         lambda exponent: Bridge(start, exponent) if exponent < 1.0 else POSTERIOR,
     )
-    step = Tempered(resample_move(kernel, sweeps, where_left(kept)), Schedule(kept))
-    return step.along([path], Population(trace))
+    resample, shifts = where_left(kept), list[float]()
+
+    def rejuvenation(population: Population, target: Target) -> Rejuvenated:
+        population, ancestors = resample(population)
+        if ancestors is None:
+            return Rejuvenated(population, None, None)
+        moved = moved_by(population, kernel, target, sweeps)
+        shifts.append(shift(population, moved.population))
+        return Rejuvenated(moved.population, ancestors, moved.acceptance, moved.displacement)
+
+    population, info = Tempered(rejuvenation, Schedule(kept)).along([path], Population(trace))
+    away = AWAY if continuous_addresses(trace) else sweeps
+    for _ in range(ROUNDS):
+        before, population = population, moved_by(population, kernel, POSTERIOR, away).population
+        shifts.append(shift(before, population))
+        if shifts[-1] < SETTLED:
+            break
+    if (worst := max(shifts)) > SHIFTED:
+        warnings.warn(
+            f"moves have changed the particles' means or variances by {worst:.1f} standard errors, and would "
+            "not if these were draws of what they move towards: the log evidence "
+            f"{population.log_evidence:.4g} is off; give a wider proposal, more particles or sweeps.",
+            RuntimeWarning,
+            stacklevel=2,
+        )
+    return Stepped(population, info)
 
 
 @dataclass(frozen=True)

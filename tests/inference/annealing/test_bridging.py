@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from typing import Any
 
 import pyro
@@ -13,10 +14,11 @@ from torch import Tensor
 
 from bcppl.errors import InputError
 from bcppl.inference import tempered, tempered_importance_sampling
-from bcppl.inference.kernels import delayed_acceptance, metropolis_hastings, repeat, sequence
+from bcppl.inference.kernels import delayed_acceptance, metropolis_hastings, repeat, sequence, until
+from bcppl.inference.kernels.rejuvenation import moved_by
 from bcppl.inference.learning import bridged, bridging
 from bcppl.inference.population import Population
-from bcppl.inference.proposals import drift
+from bcppl.inference.proposals import drift, prior
 from bcppl.inference.summaries import covariance, mean
 from bcppl.inference.targets import POSTERIOR
 from bcppl.traces import Trace, generate, simulate
@@ -37,6 +39,44 @@ def program() -> None:
 def near() -> None:
     """Two posterior standard deviations off on each axis, and three times as wide."""
     pyro.sample("x", dist.Normal(CENTER + 0.2, 0.3).to_event(1))
+
+
+def narrow() -> None:
+    """Well inside the posterior, a tenth as wide: no weight says what lies outside."""
+    pyro.sample("x", dist.Normal(CENTER, 0.01).to_event(1))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_proposal_that_is_too_narrow_is_named_and_the_posterior_is_reached(seed: int) -> None:
+    torch.manual_seed(seed)
+    few = metropolis_hastings(drift("x"))
+    with pytest.warns(RuntimeWarning, match="is off; give a wider proposal"):
+        population, _ = bridged(program, (), SEEN, 400, narrow, few, sweeps=1)
+    variances = covariance(population, "x").diagonal()
+    assert (variances > 0.7 * VARIANCE).all() and (variances < 1.4 * VARIANCE).all()
+    assert population.log_evidence < LOG_EVIDENCE - 2.0
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        bridged(program, (), SEEN, 400, near, KERNEL)
+
+
+def test_a_program_without_continuous_values_is_bridged() -> None:
+    def coin() -> None:
+        pyro.sample("y", dist.Normal(pyro.sample("heads", dist.Bernoulli(0.5)), 1.0))
+
+    def mostly_tails() -> None:
+        pyro.sample("heads", dist.Bernoulli(0.2))
+
+    torch.manual_seed(0)
+    redrawn = metropolis_hastings(prior("heads"))
+    population, _ = bridged(coin, (), {"y": torch.tensor(1.0)}, 2000, mostly_tails, redrawn)
+    likelihood = dist.Normal(torch.tensor([0.0, 1.0]), 1.0).log_prob(torch.tensor(1.0)).exp()
+    assert population.log_evidence == pytest.approx(float(likelihood.mean().log()), abs=0.05)
+    assert float(mean(population, "heads")) == pytest.approx(
+        float(likelihood[1] / likelihood.sum()), abs=0.05
+    )
+    with pytest.raises(InputError, match="none of the latent values that count is continuous"):
+        moved_by(population, redrawn, POSTERIOR, until(displacement=0.5))
 
 
 def runs(count: int, proposal: Any = near, **options: Any) -> tuple[Tensor, Tensor]:
