@@ -23,6 +23,8 @@ from bcppl.inference.population import Population
 from bcppl.inference.proposals.spread import program_draws
 from bcppl.inference.targets import Target
 
+ROUNDING = 1e-9  # of a mean change: as small a standard error is none
+
 
 class Moved(NamedTuple):
     """A rejuvenated population.
@@ -147,7 +149,8 @@ def shift(start: Population, now: Population) -> float:
         _, copy = torch.unique(start.trace[address].reshape(len(now), -1), dim=0, return_inverse=True)
         summed = torch.zeros_like(deviations).index_add_(0, copy, deviations)
         error = summed.square().sum(dim=0).sqrt()
-        most = max(most, float((mean / error).abs().nan_to_num(0.0).max()))
+        known = error > ROUNDING * (weights @ change.abs())  # unlike that of copies of one
+        most = max([most, *(mean / error).abs()[known].tolist()])
     return most
 
 
