@@ -5,7 +5,6 @@ from bcppl.beliefs.distances import average_distance, average_nearest_distance
 from bcppl.beliefs.regions import (
     Region,
     average_point_distance,
-    nearest_mode_deviation,
     pose_deviation,
     rotation_angle,
     rotation_deviation,
@@ -23,7 +22,6 @@ __all__ = [
     "average_point_distance",
     "effective_sample_size",
     "entropy_of_modes",
-    "nearest_mode_deviation",
     "normalised",
     "pose_deviation",
     "rotation_angle",

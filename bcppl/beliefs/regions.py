@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -27,7 +27,6 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.arguments import number_within
 from bcppl.beliefs.distances import average_distance
-from bcppl.beliefs.modes import cluster
 from bcppl.errors import InputError
 from bcppl.poses import Freedom
 
@@ -118,36 +117,6 @@ def _mahalanobis(belief: Belief, axes: list[int]) -> Distance:
 def pose_deviation(belief: Belief) -> Distance:
     """Mahalanobis distance along all free axes, standard deviations: the default."""
     return _mahalanobis(belief, list(belief.freedom.axes))
-
-
-def nearest_mode_deviation(translation: float = 0.01, rotation: float = 0.2) -> Measure:
-    """As `pose_deviation`, from the nearest of the belief's modes: a region of as many pieces.
-
-    Args:
-        translation: the gap between modes, metres (`bcppl.beliefs.modes.cluster`).
-        rotation: the same, radians.
-
-    The particles of a mode too small to span the free axes count as outside when the radius is chosen.
-    """
-
-    def measure(belief: Belief) -> Distance:
-        label = cluster(belief.world_from_part, translation, rotation)
-        within = [label == k for k in range(int(label.max()) + 1)]
-        pose, log_weights = belief.world_from_part, belief.log_weights
-        modes = [
-            pose_deviation(replace(belief, world_from_part=pose[k], log_weights=log_weights[k]))
-            for k in within
-        ]
-
-        def from_each(world_from_part: Tensor) -> Tensor:
-            return torch.stack([mode.of(world_from_part) for mode in modes])
-
-        particles = from_each(belief.world_from_part)
-        for row, k, mode in zip(particles, within, modes, strict=True):
-            row[k] = mode.of_particles
-        return Distance(lambda pose: from_each(pose).amin(dim=0), particles.amin(dim=0))
-
-    return measure
 
 
 def translation_deviation(belief: Belief) -> Distance:

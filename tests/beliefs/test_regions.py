@@ -13,7 +13,6 @@ from bcppl import poses
 from bcppl.beliefs import (
     Belief,
     average_point_distance,
-    nearest_mode_deviation,
     pose_deviation,
     rotation_angle,
     rotation_deviation,
@@ -144,25 +143,6 @@ def test_regions_hold_a_fresh_draw_as_often_as_they_say(weighted: bool) -> None:
     error = math.sqrt(0.9 * 0.1 / replicates)
     assert float((held / replicates - 0.905).abs().max()) < 3.5 * error
     assert naive / replicates < 0.9 - 2 * error
-
-
-def test_two_modes_make_a_region_of_two_pieces() -> None:
-    torch.manual_seed(5)
-    freedom = Freedom("xy", "z")
-    places = poses.retract(
-        CENTER, torch.stack([torch.zeros(6, dtype=torch.float64), column(0.1, 0, 0, 0, 0, 1)])
-    )
-    held, replicates = 0, 100
-    for _ in range(replicates):
-        noise = freedom.embed(0.1 * torch.randn(76, 3, dtype=torch.float64) * freedom.coordinates(SPREAD))
-        draws = poses.retract(places[(torch.rand(76) < 0.3).long()], noise)
-        belief, truth = Belief(draws[:75], torch.zeros(75, dtype=torch.float64), freedom), draws[75]
-        region = belief.credible_region(0.8, nearest_mode_deviation())
-        held += int(region.contains(truth))
-    assert abs(held / replicates - 0.81) < 3.5 * math.sqrt(0.8 * 0.2 / replicates)
-    between = poses.retract(CENTER, column(0.05, 0, 0, 0, 0, 0.5))
-    assert bool(region.contains(places).all()) and not bool(region.contains(between))
-    assert bool(belief.credible_region(0.8).contains(between)), "one ellipsoid has to hold what lies between"
 
 
 def doubled(belief: Belief) -> Belief:
