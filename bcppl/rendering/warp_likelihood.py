@@ -32,7 +32,6 @@ class Law:
     near: wp.float64
     far: wp.float64
     scale: wp.float64
-    occluder: wp.float64
     outlier: wp.float64
 
 
@@ -51,18 +50,10 @@ class Image:
 @wp.func  # type: ignore[untyped-decorator]
 def _log_density(depth: wp.float64, rendered: wp.float64, law: Law) -> wp.float64:
     away = wp.abs(depth - rendered) / law.scale
-    others = law.occluder + law.outlier
-    if others == wp.float64(0.0):
+    if law.outlier == wp.float64(0.0):
         return -away - wp.log(wp.float64(2.0) * law.scale)
-    density = wp.exp(-away) * (wp.float64(1.0) - others) / (wp.float64(2.0) * law.scale)
-    share = law.outlier
-    if law.occluder > wp.float64(0.0):
-        room = wp.min(rendered, law.far) - law.near
-        if room <= law.scale:
-            share = others
-        elif law.near < depth and depth < law.near + room:
-            density += law.occluder / room
-    return wp.log(density + share / (law.far - law.near))
+    density = wp.exp(-away) * (wp.float64(1.0) - law.outlier) / (wp.float64(2.0) * law.scale)
+    return wp.log(density + law.outlier / (law.far - law.near))
 
 
 @wp.kernel  # type: ignore[untyped-decorator]

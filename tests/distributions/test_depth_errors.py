@@ -1,4 +1,4 @@
-"""Depth with a camera's error, a bias, an occluder, several parts: against moving things, and integrals."""
+"""Depth with a camera's error, a bias, several parts: against moving things, and integrals."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from bcppl import poses
 from bcppl.arrays import Array
-from bcppl.distributions.depth import DepthDistribution, LaplaceDepth, OccludedDepth, RobustDepth
+from bcppl.distributions.depth import DepthDistribution, LaplaceDepth, RobustDepth
 from bcppl.errors import InputError
 from bcppl.geometry.camera import Camera, looking_at
 from bcppl.geometry.parts import Part
@@ -23,7 +23,7 @@ from bcppl.rendering.scene import SceneRenderer, scene_poses
 
 Kind = type[DepthDistribution]
 
-KINDS = [LaplaceDepth, RobustDepth, OccludedDepth]
+KINDS = [LaplaceDepth, RobustDepth]
 SCALE = 0.003
 BOX = trimesh.creation.box((0.06, 0.04, 0.03))
 PART = Part("box", np.asarray(BOX.vertices), np.asarray(BOX.faces, dtype=np.int64))
@@ -128,56 +128,6 @@ def test_no_error_and_no_bias_change_nothing(kind: Kind) -> None:
     )
 
 
-def density(site: DepthDistribution, readings: Array) -> Array:
-    """The density (R,) of one pixel, for each of the R particles' readings."""
-    return np.asarray(site.log_prob(torch.from_numpy(readings)[:, None, None]).exp())
-
-
-@pytest.mark.parametrize("rendered", [0.08, 0.3, 0.0502, 0.7])
-def test_an_occluded_pixel_integrates_to_one(rendered: float) -> None:
-    """Over the range, with what Laplace's noise carries out of it; nearer is likelier than farther."""
-    camera = Camera("one", 1, 1, 1.0, 1.0, 0.0, 0.0, poses.identity().numpy(), near=0.05, far=0.6)
-    behind = np.full((1, 1), rendered)
-
-    def site(count: int) -> OccludedDepth:
-        away = poses.identity(count)
-        away[:, 2] = -5.0
-        return OccludedDepth(RENDERER, camera, away, SCALE, behind, occluder=0.2, outlier=0.1)
-
-    edges = np.unique(
-        np.concatenate([np.linspace(0.05, 0.6, 4001), rendered + np.linspace(-0.03, 0.03, 801)])
-    )
-    edges = edges[(edges >= 0.05) & (edges <= 0.6)]
-    middle = 0.5 * (edges[1:] + edges[:-1])
-    below = 0.5 * math.exp(-abs(rendered - 0.05) / SCALE)
-    below = below if rendered > 0.05 else 1 - below
-    above = 0.5 * math.exp(-abs(0.6 - rendered) / SCALE)
-    above = above if rendered < 0.6 else 1 - above
-    inside = 1.0 - below - above
-    total = float((density(site(len(middle)), middle) * np.diff(edges)).sum())
-    assert total == pytest.approx(0.3 + 0.7 * inside, abs=2e-3)
-    if rendered == 0.3:
-        nearer, farther = density(site(2), np.array([0.2, 0.4]))
-        assert nearer / farther == pytest.approx(1 + (0.2 / 0.25) / (0.1 / 0.55), rel=1e-6)
-
-
-def test_occluded_samples_scatter_as_their_density_says() -> None:
-    torch.manual_seed(0)
-    site = OccludedDepth(
-        RENDERER, CAMERA, POSE[:1].expand(400, 7), SCALE, np.full((18, 24), 0.3), occluder=0.2, outlier=0.1
-    )
-    rendered = np.minimum(RENDERER.images(CAMERA, POSE[:1])[0], 0.3)
-    draws = site.sample().numpy()
-    far = draws > rendered + 12 * SCALE
-    near = draws < rendered - 12 * SCALE
-    room = (rendered - CAMERA.near - 12 * SCALE) / (rendered - CAMERA.near)
-    span = CAMERA.far - CAMERA.near
-    expect_far = 0.1 * (CAMERA.far - rendered - 12 * SCALE) / span
-    expect_near = 0.1 * (rendered - 12 * SCALE - CAMERA.near) / span + 0.2 * room
-    for found, expected in ((far, expect_far), (near, expect_near)):
-        assert abs(found.mean() - expected.mean()) < 5 * math.sqrt(0.2 / draws.size)
-
-
 def test_a_temperature_divides() -> None:
     seen = image()
     whole = RobustDepth(RENDERER, CAMERA, POSE, SCALE).log_prob(seen)
@@ -242,8 +192,6 @@ def test_bad_input_is_named() -> None:
         LaplaceDepth(RENDERER, CAMERA, POSE, SCALE, camera_error=ERROR[:3])
     with pytest.raises(InputError, match=r"camera 'above' has a bias of shape \(3,\); give \(\) or \(7,\)"):
         LaplaceDepth(RENDERER, CAMERA, POSE, SCALE, bias=BIAS[:3])
-    with pytest.raises(InputError, match="add up to less than 1"):
-        OccludedDepth(RENDERER, CAMERA, POSE, SCALE, occluder=0.6, outlier=0.5)
     bias, error = BIAS.clone(), ERROR.clone()
     bias[3], error[4, 2] = math.nan, math.inf
     with pytest.raises(InputError, match=r"1 of 7 particles have a bias that is not finite .*particles 3"):

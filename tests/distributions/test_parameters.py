@@ -16,7 +16,7 @@ import torch
 import bcppl.distributions
 from bcppl import poses
 from bcppl.distributions.contact import ChamferContacts, ContactsInTime, PegPose, Wrench
-from bcppl.distributions.depth import ClutteredDepth, LaplaceDepth, OccludedDepth, RobustDepth
+from bcppl.distributions.depth import ClutteredDepth, LaplaceDepth, RobustDepth
 from bcppl.distributions.lazy import LazyDistribution
 from bcppl.distributions.manifold import ContactManifold
 from bcppl.distributions.parameters import Range, ranges
@@ -62,7 +62,6 @@ MAKE: dict[type, Callable[..., Any]] = {
     ),
     LaplaceDepth: depth(LaplaceDepth),
     RobustDepth: depth(RobustDepth),
-    OccludedDepth: depth(OccludedDepth),
     ClutteredDepth: depth(ClutteredDepth),
     Silhouette: lambda **given: Silhouette(Renderer(), CAMERA, POSE, **{"width": 1.0, **given}),
     OnsetLocation: lambda **given: OnsetLocation(

@@ -8,7 +8,7 @@ only.
 
 from bcppl.distributions.depth.cluttered import ClutteredDepth
 from bcppl.distributions.depth.image import DepthDistribution
-from bcppl.distributions.depth.noise import LaplaceDepth, OccludedDepth, RobustDepth
+from bcppl.distributions.depth.noise import LaplaceDepth, RobustDepth
 from bcppl.distributions.depth.observed import Observed
 
 __all__ = [
@@ -16,6 +16,5 @@ __all__ = [
     "DepthDistribution",
     "LaplaceDepth",
     "Observed",
-    "OccludedDepth",
     "RobustDepth",
 ]

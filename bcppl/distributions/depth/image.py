@@ -108,7 +108,7 @@ class DepthDistribution(CameraImage):
     @property
     def _law(self) -> PixelLaw:
         """The law of a pixel; Laplace noise alone."""
-        return PixelLaw(self.camera.near, self.camera.far, self.scale, 0.0, 0.0)
+        return PixelLaw(self.camera.near, self.camera.far, self.scale, 0.0)
 
     def _noisy(self, rendered: Tensor) -> Tensor:
         """Draws of pixels at which the depth `rendered` is known, metres."""

@@ -14,15 +14,12 @@ from bcppl.compiled import compiled
 class PixelLaw(NamedTuple):
     """The law of a pixel's depth d where r is rendered, metres.
 
-    p(d) = (1 - occluder - outlier) exp(-|d - r| / scale) / (2 scale)
-    + occluder [near < d < r] / (r - near) + outlier / (far - near): see `OccludedDepth`, of which Laplace
-    noise alone and with outliers are special cases.
+    p(d) = (1 - outlier) exp(-|d - r| / scale) / (2 scale) + outlier / (far - near).
     """
 
     near: float
     far: float
     scale: float
-    occluder: float
     outlier: float
 
 
@@ -50,19 +47,10 @@ class Pixels(NamedTuple):
 def log_density(depth: float, rendered: float, law: PixelLaw) -> float:
     """The log-density of a pixel."""
     away = abs(depth - rendered) / law.scale
-    others = law.occluder + law.outlier
-    if others == 0.0:
+    if law.outlier == 0.0:
         return -away - math.log(2.0 * law.scale)
-    density = math.exp(-away) * (1.0 - others) / (2.0 * law.scale)
-    share = law.outlier
-    if law.occluder > 0.0:
-        room = min(rendered, law.far) - law.near
-        # Where no occluder fits in between, its share goes to the outliers.
-        if not room > law.scale:
-            share = others
-        elif law.near < depth < law.near + room:
-            density += law.occluder / room
-    return math.log(density + share / (law.far - law.near))
+    density = math.exp(-away) * (1.0 - law.outlier) / (2.0 * law.scale)
+    return math.log(density + law.outlier / (law.far - law.near))
 
 
 @compiled
