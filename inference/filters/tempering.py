@@ -29,7 +29,7 @@ from bcppl.inference.kernels import Kernel, Until, moved_by
 from bcppl.inference.kernels.kernel import refuse_no_kernel
 from bcppl.inference.population import Population
 from bcppl.inference.resampling import Resample, adaptive, refuse_no_resampling, systematic
-from bcppl.inference.targets import POSTERIOR, Target, cost_of
+from bcppl.inference.targets import POSTERIOR, Target
 from bcppl.traces import Trace, extend
 
 
@@ -126,15 +126,13 @@ class Path(NamedTuple):
     target: Callable[[float], Any]
 
 
-def _likelihood_path(group: Sequence[str], later: Sequence[Sequence[str]]) -> Path:
-    """Tempering of some sites, while those of later groups do not count."""
-    left_out = {address: 0.0 for others in later for address in others}
+def _likelihood_path(sites: Sequence[str]) -> Path:
+    """Tempering of some sites together."""
 
     def target(exponent: float) -> Target:
-        partly = {**left_out, **(dict.fromkeys(group, exponent) if exponent < 1.0 else {})}
-        return Target(partly) if partly else POSTERIOR
+        return Target(dict.fromkeys(sites, exponent)) if sites and exponent < 1.0 else POSTERIOR
 
-    return Path(lambda trace: POSTERIOR.part(trace, group), target)
+    return Path(lambda trace: POSTERIOR.part(trace, sites), target)
 
 
 _SWEEPS = 3
@@ -146,7 +144,6 @@ class Tempered:
 
     rejuvenation: Rejuvenation
     schedule: Schedule
-    by_site: bool = False
 
     def __call__(self, population: Population, observed: Observed) -> Stepped:
         """Assimilate observations at new addresses."""
@@ -165,41 +162,30 @@ class Tempered:
             population: weighed for all other sites.
             new: addresses of the sites; none of them is latent.
         """
-        sites = population.trace.distributions
-        ordered = sorted(new, key=lambda address: cost_of(sites[address]))
-        groups = [[a] for a in ordered] if self.by_site and new else [list(new)]
-        return self.along(
-            [_likelihood_path(group, groups[k + 1 :]) for k, group in enumerate(groups)], population
-        )
+        return self.along(_likelihood_path(list(new)), population)
 
-    def along(self, paths: Sequence[Path], population: Population) -> Stepped:
-        """Weigh and move particles along paths of densities, one after another.
-
-        Args:
-            paths: each begins where the one before ends.
-            population: weighted for the first density of the first path.
-        """
+    def along(self, path: Path, population: Population) -> Stepped:
+        """Weigh particles, weighted for the first density of a path, and move them along it."""
         start = population.log_evidence
         done, acceptances, ancestors, before, resampled = [], [], None, None, 0
         displacement = math.nan
-        for path in paths:
-            exponent, log_ratio = 0.0, path.log_ratio(population.trace)
-            while exponent < 1.0:
-                reached = exponent
-                exponent = self.schedule.after(reached, population, log_ratio)
-                done.append(exponent)
-                # 0 times -inf is no number, so a particle that cannot be loses its weight here, once.
-                population = weighed = population.reweighed((exponent - reached) * log_ratio)
-                population, chosen, acceptance, come = self.rejuvenation(population, path.target(exponent))
-                if chosen is not None:
-                    displacement = come
-                    resampled += 1
-                    ancestors = chosen if ancestors is None else ancestors[chosen]
-                    before = weighed.effective_sample_size
-                if acceptance is not None:
-                    acceptances.append(acceptance)
-                if exponent < 1.0:
-                    log_ratio = path.log_ratio(population.trace)
+        exponent, log_ratio = 0.0, path.log_ratio(population.trace)
+        while exponent < 1.0:
+            reached = exponent
+            exponent = self.schedule.after(reached, population, log_ratio)
+            done.append(exponent)
+            # 0 times -inf is no number, so a particle that cannot be loses its weight here, once.
+            population = weighed = population.reweighed((exponent - reached) * log_ratio)
+            population, chosen, acceptance, come = self.rejuvenation(population, path.target(exponent))
+            if chosen is not None:
+                displacement = come
+                resampled += 1
+                ancestors = chosen if ancestors is None else ancestors[chosen]
+                before = weighed.effective_sample_size
+            if acceptance is not None:
+                acceptances.append(acceptance)
+            if exponent < 1.0:
+                log_ratio = path.log_ratio(population.trace)
         info = StepInfo(
             sum(acceptances) / len(acceptances) if acceptances else math.nan,
             tuple(done),
@@ -220,7 +206,6 @@ def tempered(
     resample: Resample | None = None,
     share: float | Callable[[Trace], float] = 0.5,
     exponents: Sequence[float] | None = None,
-    by_site: bool = False,
     rejuvenation: Rejuvenation | None = None,
     always_move: bool = False,
 ) -> Tempered:
@@ -239,8 +224,6 @@ def tempered(
         share: tempering keeps the conditional effective sample size above this share of the particles;
             with 0 there is one exponent, 1. A number, or a function of the trace, as `sweeps`.
         exponents: fixed ones, increasing, the last 1; then `share` does not matter.
-        by_site: temper the new sites one after another, in the order of their cost and then of the program,
-            each with exponents of its own; otherwise all together.
         always_move: move after each exponent, whether or not that resampled. Whether particles are resampled
             depends on where they are, so moves that are made only then leave a bias of order 1/N in the
             evidence (one of 2 % with three particles). With it, or resampling always, and with fixed
@@ -272,4 +255,4 @@ def tempered(
             "a step is given a rejuvenation beside a kernel, sweeps or a resampling, which are its own; give "
             "one or the other."
         )
-    return Tempered(rejuvenation, Schedule(kept, fixed), by_site)
+    return Tempered(rejuvenation, Schedule(kept, fixed))

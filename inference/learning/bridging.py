@@ -114,7 +114,7 @@ def bridged(
         shifts.append(shift(population, moved.population))
         return Rejuvenated(moved.population, ancestors, moved.acceptance, moved.displacement)
 
-    population, info = Tempered(rejuvenation, Schedule(kept)).along([path], Population(trace))
+    population, info = Tempered(rejuvenation, Schedule(kept)).along(path, Population(trace))
     away = AWAY if continuous_addresses(trace) else sweeps
     for _ in range(ROUNDS):
         before, population = population, moved_by(population, kernel, POSTERIOR, away).population

@@ -265,32 +265,3 @@ def test_waste_free_on_the_points() -> None:
     moves = waste_free_moves(metropolis_hastings(drift("pose", (0.3, 1.0))), 150)
     errors, _ = POINTS_5.run(tempered(rejuvenation=moves, share=0.6))
     agrees(errors, 0.05)
-
-
-@pytest.mark.long
-def test_sites_tempered_one_after_another() -> None:
-    """Two measurements of different cost at once: the cheap one first, each with exponents of its own."""
-
-    class Dear(dist.Normal):  # type: ignore[misc]
-        cost = 2
-
-        def expand(self, batch_shape: torch.Size, _instance: Any = None) -> Dear:
-            return Dear(self.loc.expand(batch_shape), self.scale.expand(batch_shape))
-
-    def program(count: int) -> None:
-        x = pyro.sample("x", dist.Normal(number(0.0), 1.0))
-        if count:
-            pyro.sample("dear", Dear(x, number(0.2)))
-            pyro.sample("cheap", dist.Normal(x, 0.1))
-
-    seen = torch.tensor([0.9, 1.1], dtype=torch.float64)
-    covariance = torch.ones(2, 2).double() + torch.diag(torch.tensor([0.04, 0.01])).double()
-    exact = float(dist.MultivariateNormal(torch.zeros(2).double(), covariance).log_prob(seen))
-    case = Case(program, [{"dear": seen[0], "cheap": seen[1]}], exact, particles=800)
-    kernel = metropolis_hastings(drift("x", (0.5, 1.0)))
-    for exponents in (None, (0.2, 1.0)):
-        step = tempered(kernel, resample=always(), exponents=exponents, by_site=True)
-        errors, _ = case.run(step)
-        agrees(errors, 0.05)
-    _, info = step(importance_sampling(program, (0,), {}, 50), Observed((1,), case.observed[0]))
-    assert info.exponents == (0.2, 1.0, 0.2, 1.0)
