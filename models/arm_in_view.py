@@ -44,7 +44,6 @@ from bcppl.geometry.parts import Part
 from bcppl.rendering.ray_casting import RayCaster
 from bcppl.robot.kinematics import Robot
 from bcppl.sensors.scene import chosen as chosen_settings
-from bcppl.traces import Trace
 
 WIDER = 1.3  # than the fit: of the proposal
 # Smallest standard deviations of the fit: metres, radians, metres of bias, pixels of rim.
@@ -297,16 +296,3 @@ def fitted_proposal(
         pyro.sample("camera", truncated(prior, NormalPose(center, spread)))
 
     return proposal
-
-
-def along_optical_axis(trace: Trace) -> None:
-    """A proposal: a larger range bias and a nearer camera, or the reverse.
-
-    The two are strongly correlated, so that neither moves far alone.
-    """
-    bias = pyro.sample("bias", dist.Normal(trace["bias"], 0.005))
-    camera = trace["camera"]
-    forward = poses.rotation_matrix(camera)[..., 2]
-    moved = camera[..., :3] + forward * (bias - trace["bias"])[..., None]
-    around = torch.tensor([0.0005] * 6, dtype=torch.float64)
-    pyro.sample("camera", NormalPose(torch.cat([moved, camera[..., 3:]], dim=-1), around))
