@@ -3,8 +3,7 @@
 A peg that is pressed slowly through a spring is where the spring is shortest: at its command where that is
 free, otherwise at the nearest pose that the part allows. Haptic rendering computes the same: the peg is the
 god-object, or virtual proxy, of C. Zilles and J. Salisbury, A constraint-based god-object method for haptic
-display, IROS 1995; friction follows W. Harwin and N. Melder, Improved haptic rendering for multi-finger
-manipulation using friction cone based god-objects, Eurohaptics 2002.
+display, IROS 1995. There is no friction.
 """
 
 from __future__ import annotations
@@ -18,7 +17,6 @@ import trimesh
 from torch import Tensor
 
 from bcppl import poses
-from bcppl.arguments import number_within
 from bcppl.arrays import Array, Indices, Mask
 from bcppl.compiled import compiled
 from bcppl.contact.half_spaces import project_onto_half_spaces
@@ -51,25 +49,16 @@ class QuasiStaticMotion:
 
     Between stamps the peg moves straight towards its command, by steps shorter than the part's walls are
     thick. Where the part blocks it, it slides along the tangent planes of up to four contacts to the point
-    nearest to the command, or, with friction, as far as the command lies outside of the friction cone. Its
-    rotation is the commanded one, and there are no dynamics: it suits slow probes, whose controller is much
-    stiffer in rotation than the forces of a touch ask for.
+    nearest to the command. Its rotation is the commanded one, and there are no dynamics: it suits slow
+    probes, whose controller is much stiffer in rotation than the forces of a touch ask for.
 
     Attributes:
         gap: the distance between part and peg.
-        friction: Coulomb's coefficient; 0 for none.
-        pressed: bound of the commanded penetration that counts for friction, metres: guarded motions stop
-            there.
         step: upper bound of a step, metres.
-
-    Raises:
-        InputError: a number is out of range.
     """
 
-    def __init__(self, gap: PegGap, friction: float = 0.0, pressed: float = 0.002) -> None:
+    def __init__(self, gap: PegGap) -> None:
         self.gap = gap
-        self.friction = number_within("quasi-static motion is given friction {}", friction, least=0.0)
-        self.pressed = number_within("quasi-static motion is given pressed {}", pressed, least=0.0)
         self.step = float(
             np.clip(_THIN * min(_thickness(gap.part), _thickness(gap.peg)), _SHORTEST, _LONGEST)
         )
@@ -103,12 +92,12 @@ class QuasiStaticMotion:
         moved = (command[:, 1:, :3] - command[:, :-1, :3]).norm(dim=-1) + self.reach * turned
         moved = torch.cat([torch.zeros_like(moved[:, :1]), moved], dim=1)
         free = _free(self, self.separation(part, command), turned)
-        frames, limits = frames_of(part), (self.step, self.friction, self.pressed)
+        frames, longest = frames_of(part), self.step
         rows, counts = np.empty((*command.shape[:2], 8)), np.zeros(len(part), dtype=np.int64)
         path, lengths = command.numpy(), moved.numpy()
 
         def work(first: int, last: int, tables: Tables) -> int:
-            return _followed(first, last, frames, path, lengths, free, tables, limits, rows, counts)
+            return _followed(first, last, frames, path, lengths, free, tables, longest, rows, counts)
 
         with self.gap.effort.measure() as effort:
             self.gap.in_threads(work, len(part), _CHUNK)
@@ -183,7 +172,7 @@ def _followed(
     moved: Array,
     free: Mask,
     tables: Tables,
-    limits: tuple[float, float, float],
+    longest: float,
     rows: Array,
     counts: Indices,
 ) -> int:
@@ -206,7 +195,7 @@ def _followed(
             before, here = command[n, max(t - 1, 0)][None], command[n, t][None]
             local(before, here, tangent)
             turns = np.any(here[0, 3:] != before[0, 3:])
-            steps = 1 if free[n, t] and not blocked else max(1, math.ceil(moved[n, t] / limits[0]))
+            steps = 1 if free[n, t] and not blocked else max(1, math.ceil(moved[n, t] / longest))
             for step in range(1, steps + 1):
                 goal[:] = here
                 if step < steps:
@@ -220,7 +209,9 @@ def _followed(
                 rotation_matrix(goal, goal, turn)
                 known = known and bool(np.all(turn[0] == peg.rotation[0, 0]))
                 peg.rotation[0, 0] = turn[0]
-                found, known, measurements = _approached(solid, peg, target, tables, limits, gap, known, room)
+                found, known, measurements = _approached(
+                    solid, peg, target, tables, longest, gap, known, room
+                )
                 searched, counts[n] = searched + found, counts[n] + measurements
                 off = _apart(place, target)
                 blocked = off > _CONVERGED
@@ -243,7 +234,7 @@ def _approached(
     peg: Frames,
     target: Array,
     tables: Tables,
-    limits: tuple[float, float, float],
+    longest: float,
     gap: tuple[Array, Array, Array],
     known: bool,
     room: tuple[Array, Array, Array, Mask, Array],
@@ -270,7 +261,7 @@ def _approached(
         for axis in range(3):
             normal[axis] = dot(part.rotation[0, axis], gap[2][0, 0])
         converged = _CONVERGED if iteration < _PATIENT else _ROUGHLY
-        known = _step(place, target, gap[0][0, 0], normal, planes, limits, converged, active, best)
+        known = _step(place, target, gap[0][0, 0], normal, planes, longest, converged, active, best)
         if known:
             break
     return searched, known, measurements
@@ -283,7 +274,7 @@ def _step(
     distance: float,
     normal: Array,
     remembered: tuple[Array, Array, Array],
-    limits: tuple[float, float, float],
+    longest: float,
     converged: float,
     active: Mask,
     best: Array,
@@ -293,7 +284,6 @@ def _step(
     `active` and `best` are room for that. True, and no step, where it is at rest.
     """
     normals, offsets, seen = remembered
-    longest, friction, pressed = limits
     slot, least, same = 0, np.inf, False
     for p in range(len(offsets)):
         # A plane approximates the part near where it was seen; a gap wider than it allows refutes it.
@@ -313,13 +303,8 @@ def _step(
     project_onto_half_spaces(place if inside else target, normals, offsets, active, best)
     size = _apart(best, place)
     share = 1.0
-    if not inside and friction > 0.0 and distance < _TOUCHES:
-        # The command draws the peg no farther than the rim of the friction cone.
-        held = friction * min(_apart(target, best), pressed)
-        share = max(0.0, size - held) / max(size, 1e-300)
-        size = max(0.0, size - held)
     if not inside and size > longest:
-        share *= longest / size
+        share = longest / size
     if not inside and size <= converged:
         return True
     for axis in range(3):

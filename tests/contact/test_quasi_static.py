@@ -106,16 +106,6 @@ def test_on_a_tilted_face_it_slides_to_where_the_spring_is_shortest() -> None:
     assert depth.min() < -0.003 and (peg[:, 7].numpy() == (depth < -1e-6)).all()
 
 
-def test_friction_holds_it_until_the_command_leaves_the_cone() -> None:
-    rules = QuasiStaticMotion(on_a_block().gap, friction=0.3, pressed=1.0)
-    command = way((0, 0, 0.002), (0, 0, -0.002), (0.003, 0, -0.002))
-    peg = rules(poses.identity(1), command)[0]
-    expected = (command[:, 0] - 0.3 * (-(command[:, 2] - LENGTH)).clamp(min=0.0)).clamp(min=0.0)
-    torch.testing.assert_close(peg[:, 0], expected, atol=2e-6, rtol=0.0)
-    less = QuasiStaticMotion(on_a_block().gap, friction=0.3, pressed=0.001)(poses.identity(1), command)[0]
-    assert float(less[-1, 0]) == pytest.approx(0.003 - 0.3 * 0.001, abs=2e-6)
-
-
 def test_in_a_corner_both_walls_stop_it_and_it_comes_out_again() -> None:
     """Onto the top, over the edge, down beside the block, against its side, and up."""
     command = way((0, 0, 0.003), (0, 0, -0.004), (0.045, 0, -0.004), (0.03, 0, -0.004), (0.03, 0, 0.01))
