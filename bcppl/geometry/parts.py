@@ -287,9 +287,7 @@ class Guess:
         return float(np.linalg.norm(self.translation)) + swing
 
 
-def load_mesh(
-    path: str | Path, name: str | None = None, scale: float | None = None, source: str = ""
-) -> Part:
+def load_mesh(path: str | Path, name: str | None = None, scale: float | None = None) -> Part:
     """A part from an OBJ, STL, PLY, OFF or DAE file, checked, without convex pieces.
 
     Duplicate vertices, as of STL files and of seams of normals or textures, are merged: otherwise most closed
@@ -302,7 +300,6 @@ def load_mesh(
         name: the part's name; None for the file's.
         scale: metres per unit of the file: 0.001 for millimetres. None assumes metres, and refuses a part
             longer than 1 m: a small part in millimetres would be a large one in metres.
-        source: attribution and licence.
 
     Raises:
         InputError: there is no such file, it holds no mesh or is damaged, or the mesh is empty, open, or in
@@ -321,7 +318,7 @@ def load_mesh(
             f"mesh file {path} is inside out; its faces are inverted.", RuntimeWarning, stacklevel=2
         )
     vertices = factor * np.asarray(mesh.vertices, dtype=np.float64)
-    part = Part(name or path.stem, vertices, np.asarray(mesh.faces, dtype=np.int64), (), source)
+    part = Part(name or path.stem, vertices, np.asarray(mesh.faces, dtype=np.int64))
     try:
         part.check()
     except InputError as error:

@@ -62,8 +62,3 @@ def fisher_covariance(
     half = torch.linalg.solve_triangular(factor.T, inner, upper=True)
     mean = torch.linalg.solve_triangular(factor.T, half.T, upper=True)
     return 0.5 * (mean + mean.T) * unit[:, None] * unit
-
-
-def _root(matrix: Tensor) -> Tensor:
-    values, vectors = torch.linalg.eigh(0.5 * (matrix + matrix.T))
-    return (vectors * values.clamp(min=0.0).sqrt()) @ vectors.T

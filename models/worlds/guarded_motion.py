@@ -33,8 +33,7 @@ class Execution:
         world_from_peg: (T, 7) true poses of the peg.
         contact_pose: (7,) as `encoders`, when the last guarded motion was stopped; None where none was.
         state: of the simulation at the last stamp, from which the next motion continues.
-        world_from_grip: (T, 7) true poses of the frame that the robot takes for the peg's, at the sensor.
-        encoders: (T, 7) what the robot takes them to be, without noise.
+        encoders: (T, 7) what the robot takes the peg's poses to be, without noise.
         felt: (T, 6) what the wrench sensor reads, without bias and noise: late, for instance.
         world_from_part: (T, 7) true poses of the part.
     """
@@ -45,7 +44,6 @@ class Execution:
     world_from_peg: Array
     contact_pose: Array | None
     state: SimulationState
-    world_from_grip: Array
     encoders: Array
     felt: Array
     world_from_part: Array
@@ -136,7 +134,6 @@ def execute(
         world_from_peg=pegs[:count],
         contact_pose=executor.contact_pose,
         state=state,
-        world_from_grip=rows[:, POSE].copy(),
         encoders=encoders(0, count).copy(),
         felt=felt(count).copy(),
         world_from_part=parts[:count],
