@@ -36,7 +36,7 @@ from bcppl.inference.kernels import (
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import differential_evolution, drift, independent
 from bcppl.inference.resampling import always
-from bcppl.inference.targets import POSTERIOR, Target
+from bcppl.inference.targets import POSTERIOR, FunctionTarget, Target
 from bcppl.models.peg_in_hole import model
 from bcppl.models.worlds.peg_in_hole import simulate_recording
 from bcppl.sweeps import swept
@@ -54,7 +54,7 @@ def thorough(kernel: Kernel) -> Kernel:
         move = kernel(population)
 
         def plain(trace: Trace, target: Target) -> tuple[Trace, torch.Tensor]:
-            return move(trace, lambda t: target(t))  # type: ignore[arg-type]
+            return move(trace, FunctionTarget(log_density=target))
 
         return plain
 

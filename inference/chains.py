@@ -33,7 +33,7 @@ from bcppl.inference.kernels.kernel import learns, refuse_no_kernel, scattered
 from bcppl.inference.population import Population, refuse_no_population
 from bcppl.inference.progress import watched
 from bcppl.inference.resampling import Scheme, systematic
-from bcppl.inference.targets import POSTERIOR, Target
+from bcppl.inference.targets import POSTERIOR, Target, as_target
 from bcppl.traces import Trace
 from bcppl.traces.values import shapes
 
@@ -102,7 +102,7 @@ def markov_chains(
     if isinstance(start, Trace):
         start = Population(start)
     refuse_no_population("markov_chains", start)
-    population = start
+    population, target = start, as_target(target)
     weights = population.log_weights
     if scheme is not None and bool((weights != weights[0]).any()):
         population = population.selected(scheme(weights))

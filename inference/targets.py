@@ -140,17 +140,39 @@ class Target:
 POSTERIOR = Target()
 
 
-def accept(
-    target: Callable[[Trace], Tensor], old: Trace, new: Trace, log_ratio: Tensor
-) -> tuple[Tensor, Trace]:
-    """`Target.accept`, or for a plain function of the trace the same by evaluating everything."""
-    if isinstance(target, Target):
-        return target.accept(old, new, log_ratio)
-    chance = torch.log(torch.rand(old.particles, dtype=torch.float64))
-    index = (target(new) + log_ratio > chance + target(old)).nonzero().flatten()
-    return index, new[index]
+@dataclass(frozen=True, kw_only=True)
+class FunctionTarget(Target):
+    """A target that is any function of the whole trace: it has no stages, and sites have no exponents.
+
+    Attributes:
+        log_density: (N,) of a trace, up to a constant.
+    """
+
+    log_density: Callable[[Trace], Tensor]
+
+    def exponent(self, address: str) -> float:
+        """Refused."""
+        raise InputError(
+            f"the exponent of site {address!r} is asked of a target that is a function of the trace; "
+            "give a `Target`, of which each site's exponent is known."
+        )
+
+    def __call__(self, trace: Trace) -> Tensor:
+        """The log-density (N,)."""
+        return self.log_density(trace)
+
+    def above(
+        self, trace: Trace, needed: Tensor, addresses: Sequence[str] | None = None
+    ) -> tuple[Tensor, Trace]:
+        """See `Target.above`: everything is evaluated, for all particles."""
+        index = (self(trace) > needed).nonzero().flatten()
+        return index, trace[index]
+
+    def within(self, trace: Trace) -> Target:
+        """The function itself."""
+        return self
 
 
-def visible(target: Callable[[Trace], Tensor], trace: Trace) -> Trace:
-    """`Target.visible`, or for a plain function of the trace all of it."""
-    return target.visible(trace) if isinstance(target, Target) else trace
+def as_target(target: Callable[[Trace], Tensor]) -> Target:
+    """A target as kernels know it: a plain function of the trace as a `FunctionTarget`."""
+    return target if isinstance(target, Target) else FunctionTarget(log_density=target)

@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -123,7 +123,7 @@ class Path(NamedTuple):
     """
 
     log_ratio: Callable[[Trace], Tensor]
-    target: Callable[[float], Any]
+    target: Callable[[float], Target]
 
 
 def _likelihood_path(sites: Sequence[str]) -> Path:

@@ -94,12 +94,11 @@ def hamiltonian_move(
     def move(trace: Trace, target: Target) -> tuple[Trace, Tensor]:
         steps = lengths[int(torch.randint(len(lengths), ()))] if len(lengths) > 1 else lengths[0]
         space = Unconstrained(addresses, trace)
-        exponents = target.exponents if isinstance(target, Target) else {}
         start = space.read(trace)
         scale = 1.0 + jitter * (2.0 * torch.rand(len(trace), 1, dtype=torch.float64) - 1.0)
         momentum = torch.randn_like(start)
         position, last = leapfrog(
-            lambda z: space.gradient(trace, z, exponents) @ factor,
+            lambda z: space.gradient(trace, z, target.exponents) @ factor,
             start,
             momentum,
             step_size * scale.to(start.device),

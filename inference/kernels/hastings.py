@@ -12,7 +12,7 @@ from bcppl.errors import InputError
 from bcppl.inference.kernels.kernel import Kernel, Move, decided, marked, refuse_observed
 from bcppl.inference.population import Population
 from bcppl.inference.proposals.proposal import Fittable, Proposal, program_of
-from bcppl.inference.targets import Target, visible
+from bcppl.inference.targets import Target
 from bcppl.traces import Trace, assess, propose, update
 from bcppl.traces.indexing import broadcast
 
@@ -60,7 +60,7 @@ def metropolis_hastings(proposal: Proposal, *learned: Callable[[Population], Any
             updated = update(trace, new)
             refuse_observed("a proposal", forward.choices, updated.trace)
             reverse = {**forward.choices, **updated.discarded}
-            log_reverse = assess(program, (visible(target, updated.trace),), reverse, trace.particles)
+            log_reverse = assess(program, (target.visible(updated.trace),), reverse, trace.particles)
             log_ratio = torch.where(lost, -torch.inf, log_reverse - forward.log_prob)
             return decided(target, trace, updated.trace, log_ratio)
 

@@ -21,7 +21,7 @@ from bcppl.inference.kernels.jacobian import (
 from bcppl.inference.kernels.kernel import Kernel, Move, decided, marked, refuse_observed
 from bcppl.inference.population import Population
 from bcppl.inference.proposals.proposal import Fittable, Proposal, program_of
-from bcppl.inference.targets import Target, visible
+from bcppl.inference.targets import Target
 from bcppl.traces import Trace, assess, simulate, update
 from bcppl.traces.values import Values
 
@@ -84,7 +84,7 @@ def involutive(program: Proposal, involution: Involution, *, check: bool = False
             updated = update(trace, new)
             refuse_observed("the program of an involution", forward.choices, updated.trace)
             choices = {a: v for (kind, a), v in after.items() if kind == "choice"}
-            reverse = assess(choose, (visible(target, updated.trace),), choices, count)
+            reverse = assess(choose, (target.visible(updated.trace),), choices, count)
             chosen = forward.log_prob()
             # A choice to which its own program gives no density has left the range of its type.
             log_ratio = torch.where(chosen == -torch.inf, -torch.inf, reverse - chosen + log_forward)

@@ -19,7 +19,7 @@ from torch import Tensor
 from bcppl.errors import InputError
 from bcppl.inference.population import Population
 from bcppl.inference.proposals.proposal import Fittable
-from bcppl.inference.targets import Target, accept
+from bcppl.inference.targets import Target
 from bcppl.traces import Trace
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -169,7 +169,7 @@ def decided(target: Target, trace: Trace, proposed: Trace, log_ratio: Tensor) ->
 
     The log-ratio (N,) is the log-density of the reverse proposal minus that of the proposal, with Jacobian.
     """
-    index, taken = accept(target, trace, proposed, log_ratio)
+    index, taken = target.accept(trace, proposed, log_ratio)
     accepted = torch.zeros(trace.particles, dtype=torch.float64)
     accepted[index] = 1.0
     return scattered(trace, index, taken), accepted

@@ -21,7 +21,7 @@ from bcppl.inference.kernels.halving import halved, halves
 from bcppl.inference.kernels.kernel import Kernel, fitted, learns, scattered
 from bcppl.inference.population import Population
 from bcppl.inference.proposals.spread import program_draws
-from bcppl.inference.targets import Target
+from bcppl.inference.targets import Target, as_target
 
 ROUNDING = 1e-9  # of a mean change: as small a standard error is none
 
@@ -185,7 +185,7 @@ def moved_by(population: Population, kernel: Kernel, target: Target, sweeps: int
     """
     what = "a population is to be moved {} times"
     most = sweeps.most if isinstance(sweeps, Until) else whole_number(what, sweeps, least=0)
-    start, shares, made = population, [], 0
+    target, start, shares, made = as_target(target), population, [], 0
     while made < most and not (isinstance(sweeps, Until) and sweeps.reached(start, population)):
         population, accepted = _sweep(population, kernel, target)
         shares.append(accepted)
@@ -215,9 +215,8 @@ def _all_at_once(population: Population, kernel: Kernel, target: Target) -> tupl
 
 
 def _by_halves(population: Population, kernel: Kernel, target: Target) -> tuple[Population, Tensor]:
-    if isinstance(target, Target):
-        # What is known of all particles is known of each half, and stays known of those that do not move.
-        target(population.trace)
+    # What is known of all particles is known of each half, and stays known of those that do not move.
+    target(population.trace)
     population = halved(population)
     parts, shares = halves(population), torch.zeros(len(population), dtype=torch.float64)
     for mine, others in zip(parts, parts[::-1], strict=True):

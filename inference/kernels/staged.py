@@ -31,7 +31,7 @@ from bcppl.inference.population import Population
 from bcppl.inference.proposals import spread_of
 from bcppl.inference.proposals.coordinates import coordinates_of
 from bcppl.inference.proposals.spread import weighted_places
-from bcppl.inference.targets import PHYSICS, Target, cost_of
+from bcppl.inference.targets import PHYSICS, POSTERIOR, FunctionTarget, Target, cost_of
 from bcppl.traces import Trace
 
 
@@ -202,7 +202,7 @@ def delayed_acceptance(
         screen = surrogate(population) if surrogate is not None else None
 
         def in_stages(trace: Trace, target: Target) -> tuple[Trace, Tensor]:
-            if not isinstance(target, Target):
+            if isinstance(target, FunctionTarget):
                 return move(trace, target)  # a function of the whole trace has no stages
             if screen is not None:
                 return move(trace, Screened(exponents=target.exponents, surrogate=screen))
@@ -244,7 +244,7 @@ def surrogate_transition(kernel: Kernel, surrogate: Surrogate) -> Kernel:
         move, log_density = fitted(kernel, population), surrogate(population)
 
         def transition(trace: Trace, target: Target) -> tuple[Trace, Tensor]:
-            if not isinstance(target, Target) or isinstance(target, SurrogateTarget):
+            if isinstance(target, FunctionTarget):
                 return move(trace, target)  # a function of the whole trace has no costly sites
             begun = trace.without_states()
             walked, _ = move(begun, SurrogateTarget(log_density=log_density))
@@ -271,19 +271,10 @@ def _displaced(old: Trace, new: Trace) -> Tensor:
     return other.nonzero().flatten()
 
 
-@dataclass(frozen=True, kw_only=True)
-class SurrogateTarget(Target):
+class SurrogateTarget(FunctionTarget):
     """A surrogate of a log-density, zero where the latent sites are impossible, as the target of moves."""
-
-    log_density: Callable[[Trace], Tensor]
 
     def __call__(self, trace: Trace) -> Tensor:
         """The log-density (N,)."""
-        possible = self.part(trace, list(trace.choices)) > -torch.inf
+        possible = POSTERIOR.part(trace, list(trace.choices)) > -torch.inf
         return torch.where(possible, self.log_density(trace), -torch.inf)
-
-    def accept(self, old: Trace, new: Trace, log_ratio: Tensor) -> tuple[Tensor, Trace]:
-        """Which particles take their proposals: see `Target.accept`."""
-        chance = torch.log(torch.rand(old.particles, dtype=torch.float64))
-        index = (self(new) - self(old) + log_ratio > chance).nonzero().flatten()
-        return index, new[index]

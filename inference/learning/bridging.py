@@ -31,7 +31,7 @@ from bcppl.inference.kernels.kernel import refuse_no_kernel
 from bcppl.inference.kernels.rejuvenation import moved_by, shift
 from bcppl.inference.population import Population
 from bcppl.inference.proposals.coordinates import continuous_addresses
-from bcppl.inference.targets import POSTERIOR, Target
+from bcppl.inference.targets import POSTERIOR, FunctionTarget, Target
 from bcppl.traces import Program, Trace, assess, generate, propose
 
 # Standard errors by which moves change a mean or a variance: below the first the particles have settled, and
@@ -41,21 +41,11 @@ SETTLED, SHIFTED = 3.0, 5.0
 AWAY, ROUNDS = until(displacement=1.5, most=50), 10  # moves at the posterior
 
 
-@dataclass(frozen=True)
-class Bridge:
-    """The log-density (N,) of q^(1 - e) p^e, a target.
-
-    Attributes:
-        start: the log-density of q.
-        exponent: e.
-    """
-
-    start: Callable[[Trace], Tensor]
-    exponent: float
-
-    def __call__(self, trace: Trace) -> Tensor:
-        """The log-density (N,) of a trace."""
-        return self.exponent * trace.log_prob() + (1.0 - self.exponent) * self.start(trace)
+def bridge(start: Callable[[Trace], Tensor], exponent: float) -> Target:
+    """The target q^(1 - e) p^e, given the log-density (N,) of q and the exponent e."""
+    return FunctionTarget(
+        log_density=lambda trace: exponent * trace.log_prob() + (1.0 - exponent) * start(trace)
+    )
 
 
 def bridged(
@@ -102,7 +92,7 @@ def bridged(
     start = _Start(proposal, args, tuple(proposed.choices))
     path = Path(
         lambda trace: trace.log_prob() - start(trace),
-        lambda exponent: Bridge(start, exponent) if exponent < 1.0 else POSTERIOR,
+        lambda exponent: bridge(start, exponent) if exponent < 1.0 else POSTERIOR,
     )
     resample, shifts = where_left(kept), list[float]()
 

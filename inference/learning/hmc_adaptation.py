@@ -84,7 +84,7 @@ def adaptive_hmc(
         moves: dict[tuple[tuple[str, float], ...], Move] = {}
 
         def move(trace: Trace, target: Target) -> tuple[Trace, Tensor]:
-            key = tuple(sorted(target.exponents.items())) if isinstance(target, Target) else ()
+            key = tuple(sorted(target.exponents.items()))
             if key not in moves:
                 factor = learned_factor(named, population, target)
                 chosen = population.trace[systematic(population.log_weights, pilots)]
@@ -103,8 +103,7 @@ def learned_factor(addresses: tuple[str, ...], population: Population, target: T
     """The Cholesky factor (D, D) of the inverse mass matrix that the particles and their scores give."""
     space = Unconstrained(addresses, population.trace)
     position = space.read(population.trace)
-    exponents = target.exponents if isinstance(target, Target) else {}
-    _, score = space.density(population.trace, position, exponents)
+    _, score = space.density(population.trace, position, target.exponents)
     prior = torch.cat([weighted_places(population, address).unlearned for address in addresses])
     weights = normalised(population.log_weights)
     return torch.linalg.cholesky(fisher_covariance(position, score, weights, prior))
@@ -158,7 +157,7 @@ class _Flight:
     def __init__(self, pilots: Trace, addresses: tuple[str, ...], target: Target, factor: Tensor) -> None:
         self.pilots, self.factor = pilots, factor
         self.space = Unconstrained(addresses, pilots)
-        self.exponents = target.exponents if isinstance(target, Target) else {}
+        self.exponents = target.exponents
         self.place = self.space.read(pilots)
         self.density, self.gradient = self._density(self.place)
 

@@ -55,11 +55,6 @@ def particle_gibbs(*static: str, particles: int = 50) -> Kernel:
 
     def kernel(population: Population) -> Move:
         def move(trace: Trace, target: Target) -> tuple[Trace, Tensor]:
-            if not isinstance(target, Target):
-                raise InputError(
-                    "particle Gibbs is given a target that is a function of the trace; it draws by steps, "
-                    "give a `Target`, of which it knows each site's exponent."
-                )
             paths = _Conditional(trace, static, particles, target).paths()
             changed = [_differ(value, trace[address]) for address, value in paths.items()]
             return update(trace, paths).trace, torch.stack(changed).to(torch.float64).mean(dim=0)

@@ -20,7 +20,7 @@ from bcppl.inference.learning import bridged, bridging
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import drift, prior
 from bcppl.inference.summaries import covariance, mean
-from bcppl.inference.targets import POSTERIOR
+from bcppl.inference.targets import POSTERIOR, Target
 from bcppl.traces import Trace, generate, simulate
 from tests.invariance import largest_z, number
 
@@ -147,14 +147,14 @@ def test_addresses_that_the_proposal_leaves_out_come_from_the_program() -> None:
     assert abs(sum(errors) / 12) < 0.08
 
 
-def bridge(exponent: float) -> tuple[bridging.Bridge, Trace]:
+def bridge(exponent: float) -> tuple[Target, Trace]:
     """A target between near and the posterior, and exact draws of it."""
     start = bridging._Start(near, (), ("x",))
     precision = exponent / VARIANCE + (1 - exponent) / 0.09
     center = (exponent * CENTER / VARIANCE + (1 - exponent) * (CENTER + 0.2) / 0.09) / precision
     draws = generate(program, (), SEEN, 8000)[0]
     x = center + torch.randn(8000, 4, dtype=torch.float64) / math.sqrt(precision)
-    return bridging.Bridge(start, exponent), draws.at({"x": x})
+    return bridging.bridge(start, exponent), draws.at({"x": x})
 
 
 def functions(trace: Trace) -> Tensor:

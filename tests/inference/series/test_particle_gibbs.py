@@ -18,7 +18,7 @@ from bcppl.inference.population import Population
 from bcppl.inference.proposals import drift
 from bcppl.inference.series import conditional, particle_gibbs, unrolled
 from bcppl.inference.series.conditional import _Conditional
-from bcppl.inference.targets import POSTERIOR, Target
+from bcppl.inference.targets import POSTERIOR, FunctionTarget, Target
 from bcppl.traces import Series, Trace, assess, extend, generate, simulate
 from tests.inference.series.linear_series import (
     AUTOREGRESSION,
@@ -204,7 +204,7 @@ def test_refusals_say_what_to_do() -> None:
         other = simulate(AUTOREGRESSION, (), 3)
         particle_gibbs("rho")(Population(other))(other, POSTERIOR)
     with pytest.raises(InputError, match="give a `Target`"):
-        particle_gibbs("rho")(Population(trace))(trace, lambda each: each.log_prob())
+        particle_gibbs("rho")(Population(trace))(trace, FunctionTarget(log_density=Trace.log_prob))
     with pytest.raises(InputError, match="'phi'"):
         particle_gibbs("phi")(Population(trace))(trace, POSTERIOR)
     with pytest.raises(InputError, match="keep 'x/1', which `init` does not sample"):
