@@ -34,7 +34,7 @@ from torch import Tensor
 from bcppl.errors import InputError
 from bcppl.inference.filters.conditioned_backward import log_conditioned
 from bcppl.inference.filters.step import Observed, StepFunction, StepInfo, Stepped
-from bcppl.inference.kernels.halving import moved_together
+from bcppl.inference.kernels.halving import apart_from, moved_together
 from bcppl.inference.kernels.jacobian import (
     Key,
     charted,
@@ -44,7 +44,6 @@ from bcppl.inference.kernels.jacobian import (
     refuse_unequal,
 )
 from bcppl.inference.kernels.kernel import scattered, weighted
-from bcppl.inference.kernels.rejuvenation import of_program
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import Fittable, Proposal, program_of
 from bcppl.inference.resampling import Resample, adaptive, refuse_no_resampling
@@ -116,10 +115,8 @@ def move_and_weight(
     population, parts = moved_together(population, learning=learns)
     log_factor = torch.zeros(count, dtype=torch.float64)
     whole: Trace | None = None
-    for k, mine in enumerate(parts):
-        # Where all are of one family, no other is apart: programs learn from draws of the model's.
-        apart = population[parts[-1 - k]] if len(parts) > 1 or not learns else of_program(population)
-        forward, backward = _fitted(pair, apart)
+    for mine in parts:
+        forward, backward = _fitted(pair, apart_from(population, mine) if learns else population)
         old = population.trace[mine]
         trace, gained = moved_trace(forward, backward, old, observed, pair.check, ratio)
         if not (pair.inside or (observed is not None and isinstance(old, SeriesTrace))):

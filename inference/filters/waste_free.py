@@ -13,8 +13,8 @@ from bcppl.arguments import number_within, whole_number
 from bcppl.errors import InputError
 from bcppl.inference.filters.tempering import Rejuvenated, Rejuvenation
 from bcppl.inference.kernels import Kernel, fitted, halved, halves
+from bcppl.inference.kernels.halving import apart_from
 from bcppl.inference.kernels.kernel import learns, refuse_no_kernel, scattered
-from bcppl.inference.kernels.rejuvenation import of_program
 from bcppl.inference.population import Population, log_pair
 from bcppl.inference.resampling import Scheme, systematic
 from bcppl.inference.targets import Target
@@ -57,14 +57,11 @@ def waste_free_moves(
         ancestors = scheme(population.log_weights, chains)
         if learns(kernel):
             population = halved(population)
-            started = population[ancestors]
-            parts = halves(started)
-            others = [population.sides != started.sides[part[0]] for part in parts]
-            apart = [population[other] if bool(other.any()) else of_program(population) for other in others]
+            parts = halves(population[ancestors])
+            moves = [fitted(kernel, apart_from(population, ancestors[part])) for part in parts]
         else:
-            started, parts, apart = population[ancestors], [torch.arange(chains)], [population]
-        moves = [fitted(kernel, each) for each in apart]
-        current, acceptances = started.trace, []
+            parts, moves = [torch.arange(chains)], [fitted(kernel, population)]
+        current, acceptances = population.trace[ancestors], []
         kept = population[ancestors.repeat(count // chains)]
         whole = kept.trace
         for state in range(1, count // chains):

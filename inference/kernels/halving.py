@@ -15,6 +15,7 @@ from torch import Tensor
 
 from bcppl.inference.ancestry import split
 from bcppl.inference.population import Population
+from bcppl.inference.proposals.spread import program_draws
 
 
 def halved(population: Population) -> Population:
@@ -33,6 +34,18 @@ def halves(population: Population) -> list[Tensor]:
     """The indices (K,) of the particles in each half of a population that was split; one if all are in it."""
     parts = [population.sides.nonzero().flatten(), (~population.sides).nonzero().flatten()]
     return [part for part in parts if len(part)]
+
+
+def apart_from(population: Population, moved: Tensor) -> Population:
+    """The particles that those at `moved` (K,), of one half, may learn from: the other half.
+
+    Where nobody is in it, a move that is fitted to those that it moves would not leave the target invariant:
+    it learns from draws of the program, as many as there are particles.
+    """
+    others = population.sides != population.sides[moved[0]]
+    if bool(others.any()):
+        return population[others]
+    return Population(program_draws(population.trace), approximation=population.approximation)
 
 
 def moved_together(population: Population, *, learning: bool) -> tuple[Population, list[Tensor]]:

@@ -17,10 +17,9 @@ from bcppl.devices import on_device_of
 from bcppl.distributions.support import freedom_of
 from bcppl.errors import InputError
 from bcppl.inference.kernels.combinators import in_parts
-from bcppl.inference.kernels.halving import halved, halves
+from bcppl.inference.kernels.halving import apart_from, halved, halves
 from bcppl.inference.kernels.kernel import Kernel, fitted, learns, scattered
 from bcppl.inference.population import Population
-from bcppl.inference.proposals.spread import program_draws
 from bcppl.inference.targets import Target, as_target
 
 ROUNDING = 1e-9  # of a mean change: as small a standard error is none
@@ -196,11 +195,6 @@ def moved_by(population: Population, kernel: Kernel, target: Target, sweeps: int
     return Moved(population, acceptance, float(sweeps.displaced(start, population).min()))
 
 
-def of_program(population: Population) -> Population:
-    """Draws of the program, as many as there are particles: apart from all of them."""
-    return Population(program_draws(population.trace), approximation=population.approximation)
-
-
 def _sweep(population: Population, kernel: Kernel, target: Target) -> tuple[Population, Tensor]:
     total, count = torch.zeros(len(population), dtype=torch.float64), 0
     for part, moves in in_parts(kernel, population):
@@ -218,11 +212,9 @@ def _by_halves(population: Population, kernel: Kernel, target: Target) -> tuple[
     # What is known of all particles is known of each half, and stays known of those that do not move.
     target(population.trace)
     population = halved(population)
-    parts, shares = halves(population), torch.zeros(len(population), dtype=torch.float64)
-    for mine, others in zip(parts, parts[::-1], strict=True):
-        # Fitted to those that are moved it would not leave the target invariant, where no other is apart.
-        apart = population[others] if len(parts) > 1 else of_program(population)
-        moved, share = fitted(kernel, apart)(population.trace[mine], target)
+    shares = torch.zeros(len(population), dtype=torch.float64)
+    for mine in halves(population):
+        moved, share = fitted(kernel, apart_from(population, mine))(population.trace[mine], target)
         shares[mine] = share.to(torch.float64)
         population = population.with_trace(scattered(population.trace, mine, moved))
     return population, shares
