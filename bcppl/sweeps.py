@@ -124,6 +124,8 @@ def in_order(
 ) -> Iterator[Result]:
     """The results in the order of the arguments, each as soon as those before are there.
 
+    With several jobs they are begun at once, whenever the first result is asked for.
+
     Args:
         function: of one argument.
         arguments: any.
@@ -244,9 +246,9 @@ def _numbered(function: Callable[[Argument], Result], item: tuple[int, Argument]
 def _parallel(
     function: Callable[[Argument], Result], arguments: Iterable[Argument], jobs: int, returned: str
 ) -> Iterator[Result]:
+    """The results; other processes begin with them when this is called."""
     if jobs == 1:
-        yield from map(function, arguments)
-        return
+        return map(function, arguments)
     from joblib import Parallel, delayed, parallel_config
     from joblib.parallel import get_active_backend
 
@@ -259,8 +261,13 @@ def _parallel(
         workers = Parallel(return_as=returned, **settings)
     else:  # Ray's gives everything at the end
         workers = Parallel(**settings)
+    return _sent(workers(delayed(function)(argument) for argument in arguments))
+
+
+def _sent(results: Iterable[Result]) -> Iterator[Result]:
+    """The results of other processes, if what they are of could be sent there."""
     try:
-        yield from workers(delayed(function)(argument) for argument in arguments)
+        yield from results
     except PicklingError as error:
         raise InputError(
             f"the function cannot be sent to another process ({error.__cause__ or error}); leave out what "

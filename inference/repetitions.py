@@ -18,12 +18,10 @@ It prints the pooled evidence with its error, and how far the runs agree at each
 from __future__ import annotations
 
 import math
-import pickle
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, fields, replace
-from multiprocessing import get_context
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -40,6 +38,7 @@ from bcppl.inference.population import Population
 from bcppl.inference.progress import watched
 from bcppl.inference.resampling import seeded
 from bcppl.inference.summaries import is_angle, is_pose, mean
+from bcppl.sweeps import in_order
 from bcppl.traces import Trace
 from bcppl.traces.concatenation import concatenated
 
@@ -54,9 +53,8 @@ def repeated(run: Run, times: int, seed: int = 0, *, jobs: int = 1, progress: bo
             those, of which the last counts. Torch's generator is set to the seed before each call.
         times: how many runs.
         seed: the runs' own seeds are derived from it; torch's own generator is left as it was.
-        jobs: how many at a time: above 1 in processes, this one and fresh ones. Then `run` must be importable
-            there (a function of a module, or a `functools.partial` of one), and a script must keep its own
-            work behind `if __name__ == "__main__":`. Runs of other processes come without `approximation`.
+        jobs: how many at a time: above 1 in processes (`bcppl.sweeps`), but for the first, which is here.
+            Runs of other processes come without `approximation`.
         progress: show a bar, on a terminal or in a notebook.
 
     Raises:
@@ -292,48 +290,33 @@ def _population(run: Run, seed: int, number: int) -> Population:
 
 
 def _distributed(run: Run, seeds: Sequence[int], jobs: int, progress: bool) -> list[Population]:
-    """The runs in several processes, this one among them.
+    """The runs in several processes, the first in this one.
 
     A program and its simulators stay in their process: another process sends numbers only, which are put
-    into the trace of a run of this process.
+    into the trace of the run of this process.
     """
-    try:
-        pickle.dumps(run)
-    except (pickle.PicklingError, AttributeError, TypeError) as error:
-        raise InputError(
-            f"the run cannot be sent to another process ({error}); "
-            "give a function of a module, or a functools.partial of one."
-        ) from error
-    here = range(0, len(seeds), jobs)
-    threads = max(1, torch.get_num_threads() // jobs)
-    with ProcessPoolExecutor(
-        jobs - 1, get_context("spawn"), initializer=torch.set_num_threads, initargs=(threads,)
-    ) as pool:
-        elsewhere = {
-            k: pool.submit(_numbers, run, seeds[k], k + 1) for k in range(len(seeds)) if k not in here
-        }
-        runs: dict[int, Population] = {}
-        for k in watched([*here, *elsewhere], description="runs", progress=progress):
-            if k in here:
-                runs[k] = _population(run, seeds[k], k + 1)
-                _refuse_series(runs[k])
-            else:
-                try:
-                    numbers = elsewhere[k].result()
-                except BrokenProcessPool as error:
-                    what = (
-                        f"run {k + 1} (seed {seeds[k]}): its process, or one beside it, has ended ({error})"
-                    )
-                    raise InferenceError(what) from error
-                runs[k] = _put_into(runs[0], *numbers)
-    return [runs[k] for k in range(len(seeds))]
+    numbered = list(enumerate(seeds, 1))
+    others = in_order(partial(_numbers, run), numbered[1:], jobs)
+    populations: list[Population] = []
+    for number, seed in watched(numbered, description="runs", progress=progress):
+        if not populations:
+            populations.append(_population(run, seed, number))
+            _refuse_series(populations[0])
+            continue
+        try:
+            populations.append(_put_into(populations[0], *next(others)))
+        except BrokenProcessPool as error:
+            what = f"run {number} (seed {seed}): its process, or one beside it, has ended ({error})"
+            raise InferenceError(what) from error
+    return populations
 
 
 Numbers = dict[str, Any]
 
 
-def _numbers(run: Run, seed: int, number: int) -> tuple[Numbers, Numbers]:
+def _numbers(run: Run, numbered: tuple[int, int]) -> tuple[Numbers, Numbers]:
     """A run's population as arrays: the trace's values, and its other fields."""
+    number, seed = numbered
     population = _population(run, seed, number)
     trace = population.trace
     values = {"choices": trace.choices, "observations": trace.observations, "known": trace.known}

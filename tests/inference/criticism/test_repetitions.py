@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import functools
 import math
+import os
 import sys
+import threading
 from collections.abc import Iterator
-from pathlib import Path
 
 import pyro
 import pyro.distributions as dist
@@ -35,6 +36,7 @@ def program() -> None:
 
 
 SEEN = {"y": number(0.7)[0]}
+LOCK = threading.Lock()  # no other process can be sent it
 LOG_EVIDENCE = -0.5 * math.log(2 * math.pi * 1.25) - 0.5 * 0.49 / 1.25
 
 
@@ -141,52 +143,36 @@ def test_runs_hang_on_the_seed_alone_and_the_last_step_counts() -> None:
     for run, times, jobs, said in (
         (lambda seed: 3.0, 1, 1, "a float was given in place of a population"),
         (importance, 0, 1, "0 runs were asked for"),
-        (lambda seed: importance(seed), 2, 2, "cannot be sent to another process"),
+        (lambda seed, lock=LOCK: importance(seed), 2, 2, "cannot be sent to another process"),
     ):
         with pytest.raises(InputError, match=said):
             repeated(run, times, jobs=jobs)
 
 
-PROGRAM = """
-import math
-import pyro
-import pyro.distributions as dist
-import torch
-from bcppl.inference.population import Population
-from bcppl.traces import generate
-
-def run(seed):
-    def program():
-        x = pyro.sample("x", dist.Normal(torch.tensor(0.0, dtype=torch.float64), 1.0))
-        pyro.sample("y", dist.Normal(x, 0.5))
-    seen = {"y": torch.tensor(0.7, dtype=torch.float64)}
-    trace, log_weights = generate(program, (), seen, 20)
-    return Population(trace, log_weights, float(torch.logsumexp(log_weights, 0)) - math.log(20))
-"""
+def distributed(seed: int) -> Population:
+    return importance(seed, 20)
 
 
 @pytest.mark.long
-def test_processes_change_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "a_program_of_its_own.py").write_text(PROGRAM)
-    monkeypatch.syspath_prepend(str(tmp_path))
-    from a_program_of_its_own import run  # type: ignore[import-not-found]
-
-    one, two = repeated(run, 3, 4), repeated(run, 3, 4, jobs=2)
+def test_processes_change_nothing() -> None:
+    one, two = repeated(distributed, 3, 4), repeated(distributed, 3, 4, jobs=2)
     assert torch.equal(one.log_evidences, two.log_evidences)
     for mine, other in zip(one.populations, two.populations, strict=True):
         assert torch.equal(mine.trace["x"], other.trace["x"])
         assert torch.equal(mine.trace.log_prob(), other.trace.log_prob())
     assert float(mean(one.pooled, "x")) == float(mean(two.pooled, "x"))
+    own = repeated(lambda seed: importance(seed, 20), 3, 4, jobs=2)
+    assert torch.equal(one.log_evidences, own.log_evidences)
 
 
 @pytest.mark.long
-def test_a_process_that_ends_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "a_program_that_ends.py").write_text(
-        PROGRAM + "\n\ndef ends(seed):\n    import multiprocessing, os\n"
-        "    if multiprocessing.parent_process() is not None:\n        os._exit(3)\n    return run(seed)\n"
-    )
-    monkeypatch.syspath_prepend(str(tmp_path))
-    from a_program_that_ends import ends  # type: ignore[import-not-found]
+def test_a_process_that_ends_is_named() -> None:
+    here = os.getpid()
+
+    def ends(seed: int) -> Population:
+        if os.getpid() != here:
+            os._exit(3)
+        return importance(seed)
 
     with pytest.raises(InferenceError, match=r"run 2 \(seed \d+\): its process"):
         repeated(ends, 2, jobs=2)
