@@ -85,16 +85,8 @@ class OnsetLocation(LazyDistribution):
 
     def log_density(self, value: Tensor, offset: Scale, width: Scale) -> Tensor:
         """The same with an offset and a spread of the threshold, of which there may be several (S, N)."""
-        # A location that all particles share keeps its shape, and is evaluated once.
-        travelled = _travelled(self.path, value)
-        touched = torch.isfinite(travelled)
-        place = value if bool(touched.all()) else torch.where(touched[..., None], value, self.path.points[0])
-        located = self.path.locate(place)
-        here, normal = distance_at(self.distance, self.pose, place)
-        lowest = _lowest(self.distance, self.pose, self.path, travelled)
-
+        touched, travelled, off, here, lowest, approach = self._passage(value)
         inlier, spread = math.log1p(-self.outlier), torch.as_tensor(width, dtype=torch.float64)
-        approach = -(normal * located.direction).sum(dim=-1)
         score = (here + offset) / spread
         passage = -0.5 * score**2 - torch.log(spread) - 0.5 * math.log(2.0 * math.pi)
         passage = passage + torch.log(approach.clamp(min=0.0))
@@ -102,7 +94,7 @@ class OnsetLocation(LazyDistribution):
         stray = torch.tensor(self.outlier / self.path.length, dtype=torch.float64).log()
         density = torch.logaddexp(passage, stray)
         density = torch.where(travelled == 0.0, inlier + log_ndtr(-score), density)
-        density = torch.where(located.off <= OFF_PATH, density, -torch.inf)
+        density = torch.where(off <= OFF_PATH, density, -torch.inf)
         return torch.where(touched, density, inlier + log_ndtr((lowest + offset) / spread))
 
     def tail(self, value: Tensor) -> Tensor:
@@ -114,17 +106,23 @@ class OnsetLocation(LazyDistribution):
 
     def tail_of(self, value: Tensor, offset: Scale, width: Scale) -> Tensor:
         """The same with an offset and a spread of the threshold, of which there may be several (S, N)."""
-        travelled = _travelled(self.path, value)
-        touched = torch.isfinite(travelled)
-        place = value if bool(touched.all()) else torch.where(touched[..., None], value, self.path.points[0])
-        here, normal = distance_at(self.distance, self.pose, place)
-        lowest = _lowest(self.distance, self.pose, self.path, travelled)
-        approach = -(normal * self.path.locate(place).direction).sum(dim=-1)
+        touched, travelled, _, here, lowest, approach = self._passage(value)
         score = (here + offset) / width
         passage = torch.where((here < lowest) & (approach > 0.0), 2.0 * ndtr(-score.abs()), 0.0)
         at_once = (2.0 * ndtr(-score)).clamp(max=1.0)
         never = (2.0 * ndtr((lowest + offset) / width)).clamp(max=1.0)
         return torch.where(touched, torch.where(travelled == 0.0, at_once, passage), never)
+
+    def _passage(self, value: Tensor) -> tuple[Tensor, ...]:
+        """Whether there is contact, its distance along and off the path, d there, the least before, and -d'."""
+        # A location that all particles share keeps its shape, and is evaluated once.
+        travelled = _travelled(self.path, value)
+        touched = torch.isfinite(travelled)
+        place = value if bool(touched.all()) else torch.where(touched[..., None], value, self.path.points[0])
+        located = self.path.locate(place)
+        here, normal = distance_at(self.distance, self.pose, place)
+        lowest = _lowest(self.distance, self.pose, self.path, travelled)
+        return touched, travelled, located.off, here, lowest, -(normal * located.direction).sum(dim=-1)
 
     def predictive_check(self, value: Tensor, replicas: Callable[[], Any]) -> Check:
         """The check of an observed onset against the threshold's normal and the share of outliers."""
