@@ -59,19 +59,26 @@ def nearest_neighbour_entropy(belief: Belief, neighbours: int) -> float:
     neighbours = whole_number("nearest_neighbour_entropy is given {} neighbours", neighbours)
     tangent, weights, freedom = _merged(belief)
     coordinates = freedom.coordinates(tangent)
-    count, dimension = coordinates.shape
+    count = len(coordinates)
     factor = _cholesky(coordinates, weights)
     if count <= neighbours or factor is None:
         return -math.inf
-    white = torch.linalg.solve_triangular(factor, coordinates.T, upper=False).T.numpy()
-    radius, near = cKDTree(white).query(white, k=neighbours + 1)
-    local = weights[torch.from_numpy(np.asarray(near)[:, 1:])].mean(dim=1)
-    ball = 0.5 * dimension * math.log(math.pi) - math.lgamma(0.5 * dimension + 1.0)
-    volume = ball + dimension * torch.from_numpy(np.asarray(radius)[:, -1]).log()
+    near, volume = neighbourhoods(coordinates, factor, neighbours)
+    local = weights[near[:, 1:]].mean(dim=1)
     particles_density = float(digamma(neighbours) - digamma(count)) - volume
     white_entropy = -float(weights @ (particles_density + (count * local).log()))
     volume_ratio = float(factor.diagonal().log().sum())
     return white_entropy + volume_ratio + _mean_log_base_density(tangent, weights, freedom)
+
+
+def neighbourhoods(coordinates: Tensor, factor: Tensor, neighbours: int) -> tuple[Tensor, Tensor]:
+    """Each of K points with k neighbours (K, k + 1), and the log-volume (K,) up to the last, whitened."""
+    white = torch.linalg.solve_triangular(factor, coordinates.T, upper=False).T.numpy()
+    found = cKDTree(white).query(white, k=neighbours + 1)
+    radius, near = (torch.from_numpy(np.asarray(each)) for each in found)
+    dimension = len(factor)
+    ball = 0.5 * dimension * math.log(math.pi) - math.lgamma(0.5 * dimension + 1.0)
+    return near, ball + dimension * radius[:, -1].log()
 
 
 def _merged(belief: Belief) -> tuple[Tensor, Tensor, Freedom]:
@@ -82,13 +89,17 @@ def _merged(belief: Belief) -> tuple[Tensor, Tensor, Freedom]:
 def _cholesky(coordinates: Tensor, weights: Tensor) -> Tensor | None:
     """The lower factor of the weighted covariance of coordinates (K, d); None where it is singular."""
     centred = coordinates - weights @ coordinates
-    covariance = (weights[:, None] * centred).T @ centred
-    scale = covariance.diagonal().sqrt()
+    return cholesky((weights[:, None] * centred).T @ centred)
+
+
+def cholesky(covariance: Tensor) -> Tensor | None:
+    """The lower factor of a covariance (d, d) of particles; None where it is singular."""
+    scale = covariance.diagonal().clamp_min(0.0).sqrt()
     # A picometre is rounding.
     if not bool((scale > 1e-12).all()):
         return None
     correlation = covariance / torch.outer(scale, scale)
-    spans = float(torch.linalg.eigvalsh(correlation)[0]) >= 1e-10
+    spans = float(torch.linalg.eigvalsh(correlation)[0]) > 1e-10
     return scale[:, None] * torch.linalg.cholesky(correlation) if spans else None
 
 

@@ -14,15 +14,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from scipy.special import digamma
 from torch import Tensor
 
 from bcppl import poses
 from bcppl.arguments import whole_number
 from bcppl.beliefs import Belief
+from bcppl.beliefs.entropy import neighbourhoods
 from bcppl.beliefs.modes import gathered, links
 from bcppl.errors import InputError
 from bcppl.inference.design.distinct import DistinctParticles, separate_modes
@@ -147,19 +146,15 @@ def neighbour_entropy(address: str, neighbours: int = 3) -> Entropy:
 
     def fit(population: Population) -> EntropyOfWeights:
         particles, coordinates, log_base = _coordinates(population, address)
-        count, dimension = coordinates.shape
+        count = len(coordinates)
         if count <= neighbours:
             raise InputError(
                 f"the belief over {address!r} has {count} distinct particles, too few for an entropy by "
                 f"{neighbours} neighbours; use more particles, or weight_entropy()."
             )
         factor = cholesky_factor(address, weighted_covariance(coordinates, particles.weights))
-        white = torch.linalg.solve_triangular(factor, coordinates.T, upper=False).T.numpy()
-        radius, near = cKDTree(white).query(white, k=neighbours + 1)
-        about = torch.from_numpy(np.asarray(near))
-        ball = 0.5 * dimension * math.log(math.pi) - math.lgamma(0.5 * dimension + 1.0)
-        volume = ball + dimension * torch.from_numpy(np.asarray(radius)[:, -1]).log()
-        volume = volume + float(factor.diagonal().log().sum())
+        about, volume = neighbourhoods(coordinates, factor, neighbours)
+        volume += float(factor.diagonal().log().sum())
         # The log-density of the belief is this plus the log of the mean local weight.
         log_particles = float(digamma(neighbours) - digamma(count)) + math.log(count) - volume
 

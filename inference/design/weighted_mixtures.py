@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from bcppl.beliefs import effective_sample_size
+from bcppl.beliefs.entropy import cholesky
 from bcppl.errors import InputError
 
 # Of an even share of the weight: lighter particles link no modes and are left out. Together they have less
@@ -102,12 +103,8 @@ class WeightedMixtures:
 
 def cholesky_factor(address: str, covariance: Tensor) -> Tensor:
     """The lower Cholesky factor of a covariance (d, d) of particles; InputError where it is singular."""
-    scale = covariance.diagonal().clamp_min(0.0).sqrt()
-    # A picometre is rounding.
-    if bool((scale > 1e-12).all()):
-        correlation = covariance / torch.outer(scale, scale)
-        if float(torch.linalg.eigvalsh(correlation)[0]) > 1e-10:
-            return scale[:, None] * torch.linalg.cholesky(correlation)
+    if (factor := cholesky(covariance)) is not None:
+        return factor
     raise InputError(
         f"the particles at {address!r} do not span its {len(covariance)} free axes within their modes, so "
         "they have no density; use more particles, move them apart (rejuvenation), or use weight_entropy()."

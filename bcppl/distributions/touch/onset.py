@@ -114,7 +114,7 @@ class OnsetLocation(LazyDistribution):
         return torch.where(touched, torch.where(travelled == 0.0, at_once, passage), never)
 
     def _passage(self, value: Tensor) -> tuple[Tensor, ...]:
-        """Whether there is contact, its distance along and off the path, d there, the least before, and -d'."""
+        """Whether there is contact, its distance along and off the path, d there, the least so far, -d'."""
         # A location that all particles share keeps its shape, and is evaluated once.
         travelled = _travelled(self.path, value)
         touched = torch.isfinite(travelled)
