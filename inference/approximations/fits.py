@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import ChainMap
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from bcppl.distributions.pose_normals import (
     GaussianMixture,
+    PoseFactor,
     log_overlap,
     moments_within,
     normal_like,
     product_of_factors,
+    truncated,
+    widened_mixture,
 )
+from bcppl.inference.approximations.laplace import QuadraticApproximation
 
 _MODES, _FAINT = 8, 10.0  # that views leave: at most so many, within so many nats of the most probable
 
@@ -60,3 +66,30 @@ def given_fits(scene: Any, fits: Sequence[ViewpointFit]) -> GaussianMixture:
         kept = order[log_weights[order] > log_weights[order[0]] - _FAINT]
     whole = moments_within(prior, normal)
     return GaussianMixture(whole.center[kept], whole.covariance[kept], log_weights[kept].log_softmax(dim=0))
+
+
+def conditional(
+    scene: Any,
+    fits: Sequence[ViewpointFit],
+    contacts: QuadraticApproximation | None,
+    trace: Any,
+    values: Mapping[str, Tensor],
+) -> Any:
+    """The distribution of the pose given each particle's nuisance parameters: see `GaussianApproximation`."""
+    looked_up: Any = ChainMap(dict(values), trace)
+    factors: list[PoseFactor] = [
+        scene.sensor(fits[own[0]].action).factor([fits[k].action for k in own], looked_up)
+        for own in by_instrument(scene, fits)
+    ]
+    prior = scene.prior
+    given = product_of_factors(prior, factors) if factors else None
+    if contacts is None:
+        return prior if given is None else truncated(prior, given)
+    if given is None:
+        expected = normal_like(prior)
+        center = expected.center.expand(trace.particles, 7)
+        precision = torch.linalg.inv(expected.covariance).expand(trace.particles, 6, 6)
+    else:
+        given = moments_within(prior, given)
+        center, precision = given.center, torch.linalg.inv(given.covariance)
+    return widened_mixture(contacts.posterior(center, precision))

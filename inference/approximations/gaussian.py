@@ -9,7 +9,6 @@ a run that is resumed, branched or repeated gives the same bits.
 from __future__ import annotations
 
 import math
-from collections import ChainMap
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -21,29 +20,20 @@ from torch import Tensor
 from bcppl import poses
 from bcppl.cached import cached_property
 from bcppl.devices import HOST, current_device, on_host, to_device
-from bcppl.distributions.pose_normals import (
-    GaussianMixture,
-    PoseFactor,
-    matched,
-    mixture_of,
-    moments_within,
-    normal_like,
-    product_of_factors,
-    truncated,
-    widened_mixture,
-)
+from bcppl.distributions.pose_normals import GaussianMixture, matched, mixture_of, widened_mixture
 from bcppl.distributions.poses import MixturePose
 from bcppl.distributions.support import freedom_of
 from bcppl.errors import InputError
 from bcppl.inference.approximations.adaptive import adapted
-from bcppl.inference.approximations.fits import ViewpointFit, by_instrument, given_fits
+from bcppl.inference.approximations.fits import ViewpointFit, conditional, given_fits
 from bcppl.inference.approximations.laplace import (
-    Normal,
     QuadraticApproximation,
     Search,
+    component_of,
     concatenated_modes,
     quadratic_approximation,
     together,
+    within_component,
 )
 from bcppl.inference.targets import PHYSICS, cost_of
 from bcppl.sensors.capabilities import Approximated, Contacts, EntersHole, FitsPose, Linearised, Screens
@@ -147,7 +137,9 @@ class GaussianApproximation:
         own, each = known.component(found.quadratic.around), []
         for k in own.unique().tolist():
             modes = QuadraticApproximation(*(values[own == k] for values in found.quadratic))
-            each.append(adapted(found._sites, _normal(known, k), modes, _within(known, k, wider)))
+            each.append(
+                adapted(found._sites, component_of(known, k), modes, within_component(known, k, wider))
+            )
         return replace(found, adapted=concatenated_modes(each))
 
     @on_host()
@@ -176,7 +168,7 @@ class GaussianApproximation:
         entering = [(sensor, c) for sensor, c in by_sensor if isinstance(sensor, EntersHole)]
         each = []
         for k in range(len(known.centers)):
-            mine, normal = _within(known, k, before), _normal(known, k)
+            mine, normal = within_component(known, k, before), component_of(known, k)
             near = normal.center if mine is None else torch.cat([normal.center, mine.centers])
             inside = [sensor.in_hole(c, near) for sensor, c in entering]
             inside = [places for places in inside if len(places.part)]
@@ -347,24 +339,7 @@ class GaussianApproximation:
 
         `values` has those that the trace lacks, by address.
         """
-        looked_up: Any = ChainMap(dict(values or {}), trace)
-        fits = list(self.fits.values())
-        factors: list[PoseFactor] = [
-            self.scene.sensor(fits[own[0]].action).factor([fits[k].action for k in own], looked_up)
-            for own in by_instrument(self.scene, fits)
-        ]
-        prior = self.scene.prior
-        given = product_of_factors(prior, factors) if factors else None
-        if self.adapted is None:
-            return prior if given is None else truncated(prior, given)
-        if given is None:
-            expected = normal_like(prior)
-            center = expected.center.expand(trace.particles, 7)
-            precision = torch.linalg.inv(expected.covariance).expand(trace.particles, 6, 6)
-        else:
-            given = moments_within(prior, given)
-            center, precision = given.center, torch.linalg.inv(given.covariance)
-        return widened_mixture(self.adapted.posterior(center, precision))
+        return conditional(self.scene, list(self.fits.values()), self.adapted, trace, values or {})
 
     def predicted(self, trace: Any) -> Any:
         """The Gaussian with the moments of `conditional`; None where no measurement is included yet."""
@@ -372,18 +347,3 @@ class GaussianApproximation:
         if before is self.scene.prior:
             return None
         return matched(before) if isinstance(before, MixturePose) else before
-
-
-def _normal(prior: GaussianMixture, component: int) -> Normal:
-    """One of a prior's components."""
-    return Normal(prior.centers[component, None], torch.linalg.inv(prior.covariances[component])[None])
-
-
-def _within(
-    prior: GaussianMixture, component: int, mixture: GaussianMixture | None
-) -> GaussianMixture | None:
-    """Those of a mixture's components that are within one of a prior's; None for none."""
-    if mixture is None:
-        return None
-    own = prior.component(mixture.centers) == component
-    return GaussianMixture(*(values[own] for values in mixture)) if bool(own.any()) else None

@@ -51,6 +51,21 @@ class Normal(NamedTuple):
     precision: Tensor
 
 
+def component_of(prior: GaussianMixture, component: int) -> Normal:
+    """One of a prior's components."""
+    return Normal(prior.centers[component, None], torch.linalg.inv(prior.covariances[component])[None])
+
+
+def within_component(
+    prior: GaussianMixture, component: int, mixture: GaussianMixture | None
+) -> GaussianMixture | None:
+    """Those of a mixture's components that are within one of a prior's; None for none."""
+    if mixture is None:
+        return None
+    own = prior.component(mixture.centers) == component
+    return GaussianMixture(*(values[own] for values in mixture)) if bool(own.any()) else None
+
+
 class QuadraticApproximation(NamedTuple):
     """A log-likelihood to second order around each of its M modes, the one of largest weight first."""
 
