@@ -21,7 +21,7 @@ from bcppl.errors import InputError
 from bcppl.inference.kernels import Kernel, cycle, metropolis_hastings, moved_by, repeat
 from bcppl.inference.population import Population
 from bcppl.inference.proposals import Fittable, drift
-from bcppl.inference.targets import POSTERIOR, Target
+from bcppl.inference.targets import POSTERIOR, Target, as_target
 from bcppl.poses import Freedom
 from bcppl.traces import Trace, generate, simulate
 from tests.inference.kernels.exact_targets import (
@@ -75,7 +75,7 @@ def worst_z(
     trace = exact(DRAWS)
     before = functions(trace[address])
     for _ in range(times):
-        trace, _ = move(trace, target)
+        trace, _ = move(trace, as_target(target))
     return largest_z(before, functions(trace[address]))
 
 

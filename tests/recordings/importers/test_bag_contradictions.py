@@ -132,10 +132,11 @@ def test_two_sensors_on_one_topic_are_refused(tmp_path: Path) -> None:
 
 def test_a_stamp_of_zero_is_a_time_where_time_begins_at_zero(tmp_path: Path) -> None:
     table, notes = wrenches(tmp_path, lambda k: (0.01 * k, "ft"), Rows("/ft", wrench))
-    assert table[:, 0] == pytest.approx(0.01 * np.arange(20)) and not notes
+    assert table[:, 0] == pytest.approx(0.01 * np.arange(20))
+    assert notes == ["in the frame 'ft' by its messages"]
 
 
 def test_a_stamp_of_zero_is_that_of_reception_on_the_same_clock(tmp_path: Path) -> None:
     table, notes = wrenches(tmp_path, lambda k: (k % 2 and 1.7e9 + 0.01 * k, "ft"), Rows("/ft", wrench))
     assert table[:, 0] == pytest.approx(1.7e9 + 0.01 * np.arange(20), abs=0.03)
-    assert notes == ["10 of 20 header stamps are zero, and the time of reception stands for them"]
+    assert notes[1:] == ["10 of 20 header stamps are zero, and the time of reception stands for them"]
