@@ -152,7 +152,8 @@ def test_what_cannot_be_told_gives_no_other_cause(name: str) -> None:
     assert doubts(plausibility.MISTAKES[name].made(right(3, False))) == []
 
 
-def test_a_probe_that_begins_in_contact_is_named_and_nothing_else() -> None:
+@pytest.mark.parametrize("load", [0.0, 30.0])
+def test_a_probe_that_begins_in_contact_is_named_and_nothing_else(load: float) -> None:
     """Its wrench is tared by the contact: where the peg is free it seems pulled, and a wrong cause fits."""
     scene, knots = bench_scene(3), poses.identity(4)
     surface = float(scene.part.vertices[:, 2].max()) - float(scene.peg.vertices[:, 2].min())
@@ -161,10 +162,27 @@ def test_a_probe_that_begins_in_contact_is_named_and_nothing_else() -> None:
     stiffness, damping = np.array([2500.0] * 3 + [150.0] * 3), np.array([120.0] * 3 + [2.5] * 3)
     probe = Probe("up", np.array([0.0, 0.6, 1.2, 2.0]), path, stiffness, damping, np.arange(0.0, 2.0, 0.01))
     rollout = PegPhysics(scene.part, scene.peg).start(torch.from_numpy(scene.truth)[None], probe).advance(200)
-    measured = windows(probe, rollout.wrench[0], rollout.world_from_peg[0], 50)
+    wrench = rollout.wrench[0] + load * np.eye(6)[1]
+    measured = windows(probe, wrench, rollout.world_from_peg[0], 50)
     (found,) = doubts(replace(scene.look(), measurements=measured))
     assert_one_sentence(found)
     assert "probe 'up' has a force of" in found and "probably it begins in contact" in found
+    assert ("in its first rows" in found) == (load == 0.0)
+
+
+@pytest.mark.parametrize("seed", [3, 5, 6])
+def test_a_probe_that_begins_in_contact_and_ends_in_another_is_named(seed: int) -> None:
+    recording = right(seed, False)
+    several = [each for each in recording.measurements if each.kind == "window"]
+    first = next(k for k, w in enumerate(several) if np.linalg.norm(w.observation.wrench[-1, :3]) > 6.0)
+    late = several[first].observation
+    rows = slice(len(late.times) - 12, None)
+    cut = replace(
+        late, times=late.times[rows], wrench=late.wrench[rows], world_from_peg=late.world_from_peg[rows]
+    )
+    others = [replace(several[first], observation=cut), *several[first + 1 :]]
+    (found,) = doubts(replace(recording, measurements=others))
+    assert "probably it begins in contact" in found
 
 
 def test_a_peg_that_is_where_two_sources_say_jumps() -> None:

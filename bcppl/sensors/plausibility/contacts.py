@@ -42,6 +42,7 @@ class Felt:
         times: (T,) s.
         wrench: (T, 6) tared, in the peg's frame.
         pose: (T, 7) world_from_peg.
+        zero: (6,) that it is tared by.
         noise: (6,) standard deviations of the rows of which the zero is the mean.
     """
 
@@ -49,7 +50,13 @@ class Felt:
     times: Array
     wrench: Array
     pose: Array
+    zero: Array
     noise: Array
+
+    def scaled(self, force: float, torque: float) -> Felt:
+        """The same in other units."""
+        factors = np.repeat([force, torque], 3)
+        return replace(self, **{name: factors * getattr(self, name) for name in ("wrench", "zero", "noise")})
 
     @property
     def size(self) -> Array:
@@ -82,9 +89,9 @@ def felt_by(windows: Sequence[Measurement]) -> list[Felt]:
             for column in ("times", "wrench", "world_from_peg")
         )
         if len(times) > 2 * ZERO:
-            zero = wrench[:ZERO]
-            felt = Felt(several[0].action.probe, times, wrench - zero.mean(axis=0), pose, zero.std(axis=0))
-            probes.append(felt)
+            first = wrench[:ZERO]
+            zero, noise = first.mean(axis=0), first.std(axis=0)
+            probes.append(Felt(several[0].action.probe, times, wrench - zero, pose, zero, noise))
     return probes
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 
@@ -17,6 +16,8 @@ FASTEST = 3.0  # m/s of a peg that an arm moves
 STILL, MOVED = 0.001, 0.005  # m: a command that stands still, a peg that moves
 LEFT = 0.005  # m from where it began: the peg has left, and retreats over as much again
 STEADY = 0.3  # of a force: by so much it may vary
+WEAK = 0.3  # of the force of a zero, and
+OFTEN = 0.1  # of the stamps that have as little, of a peg that moves: there it is free
 AGAINST = 0.7  # the least cosine between a retreat and the force that it seems to overcome
 FEWEST = 10  # stamps in contact, below which they decide nothing
 
@@ -55,12 +56,11 @@ def torque_unit(felt: Felt, peg: Part) -> tuple[float, str]:
 def in_newtons(felt: Felt, peg: Part) -> tuple[Felt, list[str]]:
     """The probe in newtons and newton metres, and the mistakes in words."""
     force, first = force_unit(felt)
-    scaled = replace(felt, wrench=felt.wrench * ([force] * 3 + [1.0] * 3))
+    scaled = felt.scaled(force, 1.0)
     torque, second = torque_unit(scaled, peg)
     if first and torque == force:
         first, second = f"{first}, and torques too", ""
-    scaled = replace(scaled, wrench=scaled.wrench * ([1.0] * 3 + [torque] * 3))
-    return scaled, [words for words in (first, second) if words]
+    return scaled.scaled(1.0, torque), [words for words in (first, second) if words]
 
 
 def zero_doubt(felt: Felt) -> Iterator[str]:
@@ -68,7 +68,19 @@ def zero_doubt(felt: Felt) -> Iterator[str]:
 
     Then that contact's force, reversed, is felt from when the peg leaves the surface, against it, until the
     end. A surface that is met later is not felt as early, and one that is slid on does not oppose the motion.
+    Of a sensor that is tared, or relieved of the tool's weight, the zero alone tells: it is a force where
+    there is hardly one elsewhere.
     """
+    taken = float(np.linalg.norm(felt.zero[:3]))
+    weak = np.linalg.norm((felt.wrench + felt.zero)[:, :3], axis=1) < WEAK * taken
+    moves = float(np.ptp(felt.pose[weak, :3], axis=0).max()) if weak.any() else 0.0
+    if taken > 2.0 * LEAST and weak.mean() > OFTEN and moves > 2.0 * LEFT:
+        yield (
+            f"a force of {taken:.1f} N in its first rows, which are taken for the sensor's zero, and hardly "
+            f"any in {100.0 * weak.mean():.0f} % of the others: probably it begins in contact; record from "
+            "before that"
+        )
+        return
     away = np.linalg.norm(felt.pose[:, :3] - felt.pose[0, :3], axis=1)
     if away.max() < 2.0 * LEFT:
         return
