@@ -58,8 +58,14 @@ def test_wrong_clocks_are_refused(tmp_path: Path) -> None:
     times, values = np.arange(1000) / 100.0, np.arange(1000.0)
     with pytest.raises(InputError, match=r"run backwards at 499 rows, first from 4\.990000 to 0\.000000 s"):
         read(tmp_path, np.concatenate([times[:500], times[:500]]), values)
-    with pytest.raises(InputError, match=r"probably milliseconds.*state pose\.time\.unit"):
-        read(tmp_path, 1000.0 * times, values)
+    for right, scale, stated in (
+        ("ms", 1e3, ["s", "ns"]),
+        ("us", 1e6, ["s", "ms"]),
+        ("ns", 1e9, ["ms", "us"]),
+    ):
+        for unit in stated:
+            with pytest.raises(InputError, match=rf"probably they are in {right}: state pose\.time\.unit"):
+                read(tmp_path, scale * times, values, unit)
     with pytest.raises(InputError, match="has 0 usable rows"):
         read(tmp_path, times, np.full(1000, np.nan))
 

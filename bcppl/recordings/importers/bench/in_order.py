@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
+from typing import get_args
 
 import numpy as np
 
 from bcppl.arrays import Array
 from bcppl.errors import InputError
+from bcppl.recordings.importers.bench.configuration.field_types import Time, factor
 from bcppl.recordings.importers.bench.configuration.fields import StreamFields
 from bcppl.recordings.importers.bench.sources import Log
 from bcppl.recordings.streams import Stream
 from bcppl.sensors import checks
 
+USUAL = 0.005  # s between stamps
 LOST = 1.5  # median intervals: a longer one has lost rows
 MOST_BACKWARDS = 0.01  # of the rows: more are no few messages that came late
 
@@ -27,8 +31,15 @@ def read_stream(name: str, fields: StreamFields, log: Log, report: list[str]) ->
     table, notes = log.rows(name, fields)
     stream, left_out = _in_order(name, table[:, 0], table[:, 1:])
     for problem in checks.readings(f"{name}'s stamps", stream.times):
-        remedy = f"see the header stamps of {fields.topic}" if fields.topic else f"state {name}.time.unit"
-        raise InputError(f"{problem.rstrip('.')} ({remedy}).")
+        if fields.topic:
+            raise InputError(f"{problem.rstrip('.')} (see the header stamps of {fields.topic}).")
+        unit = fields.time.unit
+        step = stream.step / factor(unit)
+        likely = min(get_args(Time), key=lambda each: abs(math.log(step * factor(each) / USUAL)))
+        raise InputError(
+            f"{name}'s stamps are {step:.4g} {unit} apart ({stream.step:.4g} s), as of no sensor; probably "
+            f"they are in {likely}: state {name}.time.unit."
+        )
     left_out = [*notes, *left_out]
     report.append(f"{_described(stream)}{''.join(f'; {each}' for each in left_out)}")
     return stream
