@@ -23,7 +23,7 @@ from bcppl.poses import as_pose, compose, inverse, rotation_matrix
 from bcppl.sensors import Measurement, Recording, checks, register
 from bcppl.sensors.layout import POSE_UNITS, TEXT, Layout, number, numbers
 from bcppl.sensors.protocol import FAINT, Indexed, Placement, PlannedAsIs
-from bcppl.sensors.scene import OneSite
+from bcppl.sensors.scene import LinearisedSite
 
 NOISE, OUTLIER = 0.0003, 0.01  # standard deviation (m) of a distance, and the probability of any in the range
 
@@ -121,10 +121,10 @@ class WristLaser(PlannedAsIs):
     observation = Layout(Distance, {"metres": number("m")})
     caption = "the beam as far as it reaches"
 
-    def prepare(self, recording: Recording) -> OneSite:
+    def prepare(self, recording: Recording) -> LinearisedSite:
         """The likelihood of distances."""
         site = partial(BeamDistance, recording.part)
-        return OneSite("laser", site, lambda distance: torch.tensor(distance.metres).double())
+        return LinearisedSite("laser", site, lambda distance: torch.tensor(distance.metres).double())
 
     def problems(self, measurements: Indexed, recording: Recording) -> Iterator[tuple[int, str]]:
         """Problems of beams and distances."""

@@ -59,12 +59,12 @@ class Likelihood(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class OneSite:
-    """The likelihood of measurements with one site each (`Likelihood` and `capabilities.Linearised`).
+    """The likelihood of measurements with one site each.
 
     Attributes:
         name: of the sites; addresses are name_0, name_1, ...
         site: the distribution at poses (N, 7) of the part, given the action and metres that are added to its
-            standard deviation in quadrature; it has a `quadratic` for filters that approximate it.
+            standard deviation in quadrature.
         value: the observed value of an observation.
     """
 
@@ -84,16 +84,20 @@ class OneSite:
         """The observed values of these measurements, by address."""
         return {self.address(n): self.value(m.observation) for n, m in measurements}
 
+    @property
+    def efforts(self) -> Mapping[str, Effort]:
+        """The cost of simulators: it is not counted."""
+        return {}
+
+
+class LinearisedSite(OneSite):
+    """The same of a distribution with a `quadratic`, by which filters approximate it (`Linearised`)."""
+
     def sites(
         self, measurements: Sequence[Approximated], part: Tensor, blur: float
     ) -> Iterator[tuple[Any, Tensor]]:
         """Each measurement's likelihood at poses (S, 7), its noise `blur` wider, and its value."""
         yield from ((self.site(part, action, blur), value) for _, action, value in measurements)
-
-    @property
-    def efforts(self) -> Mapping[str, Effort]:
-        """The cost of simulators: it is not counted."""
-        return {}
 
 
 Prepare = Callable[[Recording], Likelihood | None]
@@ -147,6 +151,10 @@ class Scene:
         """The same scene with its prior on a device; likelihoods work where the poses are that they get."""
         prior = to_device(self.prior, device)
         return self if prior is self.prior else replace(self, prior=prior)
+
+    def likelihoods_of(self, actions: Sequence[Any]) -> list[Likelihood]:
+        """The likelihoods of all kinds that some actions are of."""
+        return list({id(each): each for each in map(self.sensor, actions)}.values())
 
     @property
     def efforts(self) -> Mapping[str, Effort]:

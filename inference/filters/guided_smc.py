@@ -42,6 +42,7 @@ from bcppl.inference.filters.step import (
     Stepped,
     descended,
 )
+from bcppl.inference.filters.tempered_smc import kernel as fitted_moves
 from bcppl.inference.filters.tempering import Rejuvenated, resample_move, tempered
 from bcppl.inference.filters.view_search import is_refuted, searched_by_climbing
 from bcppl.inference.kernels import Kernel, composed, metropolis_hastings, sequence, surrogate_transition
@@ -58,7 +59,7 @@ from bcppl.inference.proposals.approximated import (
 )
 from bcppl.inference.proposals.coordinates import continuous_addresses
 from bcppl.inference.targets import POSTERIOR, Target, runs_physics
-from bcppl.sensors.capabilities import Defers, FitsPose
+from bcppl.sensors.capabilities import Defers, FitsPose, Linearised
 from bcppl.traces import Model, Program, Trace, extend
 
 WALK = (0.2, 2.0)  # scales of the random walks
@@ -75,6 +76,7 @@ ALL = 0.99  # the same, from which on nothing is made of the limits
 # them by .2 to 1 where touches tell them, and by less along a bent ridge such as a peg wedged in a hole
 # leaves. There particles died out along it from window to window, and what was left was sure of a part.
 DISPLACED, MOST_SWEEPS = 0.5, 6
+UNGUIDED = 12  # sweeps after each exponent where nothing approximates a measurement, as of `tempered_smc`
 # Where physics decides about moves, and few particles were left to it, many of their copies stay where they
 # are, as at the end of `peg_probe`. So as large a share of the poses is to differ, too.
 DISTINCT = 0.75
@@ -135,6 +137,7 @@ def guided(
     threshold: float = 0.5,
     screen: bool = True,
     search: Callable[[Population, Trace], Searched] | None = None,
+    otherwise: StepFunction | None = None,
 ) -> StepFunction:
     """A step that assimilates a measurement by SMCP3, resamples when needed, and moves the particles.
 
@@ -148,6 +151,8 @@ def guided(
             moves them before each is simulated, where physics says little beyond that likelihood.
         search: given the population after each step and the trace before it, returns that population or
             another that takes its place, and where its particles come from.
+        otherwise: assimilates, once a measurement is of a kind that nothing approximates; unless given, by
+            tempering and these moves.
     """
 
     def resample(population: Population) -> tuple[Population, Tensor | None]:
@@ -174,6 +179,7 @@ def guided(
 
     doubled = 2 if isinstance(sweeps, Until) else 2 * sweeps
     by_tempering = tempered(moves, sweeps=doubled, resample=resample)
+    unguided = by_tempering if otherwise is None else otherwise
 
     def step(population: Population, observed: Observed) -> Stepped:
         scene, actions = observed.args
@@ -188,6 +194,8 @@ def guided(
         before = before.updated()
         after = before.including(scene, len(actions) - 1, action, values)
         population = population.with_approximation(after)
+        if not all(_is_approximated(sensor) for sensor in scene.likelihoods_of(actions)):
+            return settled(unguided(population, observed), population.trace)
         least = math.ceil(SEVERAL / len(population)) if after.is_ambiguous else 1
         kernels = pair(before, after, action)
         screens = screen and any(after.screens(each) for each in actions)
@@ -225,6 +233,10 @@ def guided(
         )
 
     return step
+
+
+def _is_approximated(sensor: Any) -> bool:
+    return isinstance(sensor, FitsPose | Linearised | Defers)
 
 
 def _given_all(approximation: Any, trace: Trace, actions: Sequence[Any]) -> Any:
@@ -340,7 +352,14 @@ def infer(
 
     times = sweeps or until(displacement=DISPLACED, of=(model.pose,), most=MOST_SWEEPS)
     step = guided(
-        gaussian, gaussian_pair, moves, sweeps=times, threshold=threshold, screen=screen, search=search
+        gaussian,
+        gaussian_pair,
+        moves,
+        sweeps=times,
+        threshold=threshold,
+        screen=screen,
+        search=search,
+        otherwise=tempered(fitted_moves(model.pose), sweeps=UNGUIDED, share=0.8),
     )
     return smc(
         model, recording, step=step, particles=particles, seed=seed, scene=scene, start=start, device=device

@@ -8,11 +8,14 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
-from bcppl.inference import tempered_smc
+from bcppl.geometry.parts import Guess
+from bcppl.inference import guided_smc, importance_sampling, observations_of, tempered_smc
 from bcppl.models.look_and_touch import model
 from bcppl.recordings import load, problems, save
 from bcppl.sensors import Measurement, protocol, sensor_named
@@ -39,6 +42,14 @@ def test_a_new_inference_program_runs(bcppl: Callable[..., Ran], tmp_path: Path,
     assert 0.0 < float(json.loads(ran.out)["rows"][1]["acc."]) < 1.0
 
 
+def evidence_by_draws(recording: Any) -> float:
+    """The log evidence of a recording by draws of the prior."""
+    torch.manual_seed(0)
+    each = list(observations_of(model, model.prepare(recording), recording.measurements))
+    values = {address: value for one in each for address, value in one.observations.items()}
+    return importance_sampling(model.program, each[-1].args, values, 20000).log_evidence
+
+
 @pytest.mark.usefixtures("own_registry")
 def test_a_new_sensor_is_saved_checked_and_explained(
     bcppl: Callable[..., Ran], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -59,6 +70,10 @@ def test_a_new_sensor_is_saved_checked_and_explained(
     scene = model.prepare(load(tmp_path / "own.h5"))
     *_, last = tempered_smc.infer(model, recording, particles=40, scene=scene, sweeps=2)
     assert last.taken == 2 and np.isfinite(last.info.log_evidence)
+    # It has no quadratic approximation, which guided SMC does without.
+    free = replace(recording, guess=Guess(truth, translation=[0.003] * 3, angle=0.05))
+    *_, guided = guided_smc.infer(model, free, particles=200)
+    assert guided.info.log_evidence == pytest.approx(evidence_by_draws(free), abs=0.5)
 
     # Of another process, in which the model's file imports the sensor's.
     assert bcppl("new", "model", "gauged").code == 0

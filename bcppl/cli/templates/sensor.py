@@ -2,7 +2,8 @@
 
 Import this file in your model's file, or name it as an entry point of the group "bcppl.sensors": recordings
 with this kind are then saved, checked, described and explained. A candidate for the next measurement, a
-drawing, a quadratic approximation are further methods (`bcppl.sensors.protocol`, and docs/new_sensor.md).
+drawing, a quadratic approximation (`LinearisedSite` in place of `OneSite`) are further methods
+(`bcppl.sensors.protocol`, and docs/new_sensor.md).
 """
 
 from __future__ import annotations
