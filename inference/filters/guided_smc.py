@@ -151,8 +151,8 @@ def guided(
             moves them before each is simulated, where physics says little beyond that likelihood.
         search: given the population after each step and the trace before it, returns that population or
             another that takes its place, and where its particles come from.
-        otherwise: assimilates, once a measurement is of a kind that nothing approximates; unless given, by
-            tempering and these moves.
+        otherwise: assimilates in place of this step once a measurement is of a kind that nothing
+            approximates, as the likelihoods of a `bcppl.sensors.Scene` tell.
     """
 
     def resample(population: Population) -> tuple[Population, Tensor | None]:
@@ -179,7 +179,6 @@ def guided(
 
     doubled = 2 if isinstance(sweeps, Until) else 2 * sweeps
     by_tempering = tempered(moves, sweeps=doubled, resample=resample)
-    unguided = by_tempering if otherwise is None else otherwise
 
     def step(population: Population, observed: Observed) -> Stepped:
         scene, actions = observed.args
@@ -194,8 +193,8 @@ def guided(
         before = before.updated()
         after = before.including(scene, len(actions) - 1, action, values)
         population = population.with_approximation(after)
-        if not all(_is_approximated(sensor) for sensor in scene.likelihoods_of(actions)):
-            return settled(unguided(population, observed), population.trace)
+        if otherwise is not None and not all(map(_is_approximated, scene.likelihoods_of(actions))):
+            return settled(otherwise(population, observed), population.trace)
         least = math.ceil(SEVERAL / len(population)) if after.is_ambiguous else 1
         kernels = pair(before, after, action)
         screens = screen and any(after.screens(each) for each in actions)
