@@ -3,6 +3,7 @@ from bcppl.inference.planning.constraints import (
     Candidates as Candidates,
     Constraint as Constraint,
     feasible as feasible,
+    per_candidate as per_candidate,
 )
 from bcppl.inference.planning.insertion import (
     InsertionParameters as InsertionParameters,

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from bcppl.arguments import named
 from bcppl.errors import InputError
 from bcppl.sensors.candidates import Candidate
 
@@ -59,10 +60,15 @@ def feasible(candidates: Iterable[Candidate], constraints: Sequence[Constraint])
     """The candidates that satisfy all constraints.
 
     Raises:
-        InputError: a constraint does not give a boolean for each candidate.
+        InputError: a constraint is none, or does not give a boolean for each candidate.
     """
     remaining, excluded = list(candidates), Counter[str]()
     for constraint in constraints:
+        if not isinstance(constraint, Constraint):
+            raise InputError(
+                f"{named('{} is given in place of a constraint on candidates', constraint)}; of a function "
+                'of one candidate make one by per_candidate("are too long", function).'
+            )
         flags = np.asarray(constraint.satisfied(remaining) if remaining else np.ones(0, dtype=bool))
         if flags.dtype != bool or flags.shape != (len(remaining),):
             raise InputError(

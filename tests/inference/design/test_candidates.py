@@ -168,6 +168,8 @@ def test_constraints_count_the_candidates_that_violate_them() -> None:
     found = feasible([*plans, hard], [force_at_most(10.0), approach_within(down, 0.5, "come from aside")])
     assert found.excluded == {"press with more than 10 N": 1, "come from aside": 3}
     assert str(found) == "1 candidate; excluded those that press with more than 10 N (1), come from aside (3)"
+    with pytest.raises(InputError, match=r'of a function of one candidate make one by per_candidate\("are'):
+        left(lambda plan: True)
 
 
 @pytest.mark.long
