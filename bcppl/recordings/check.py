@@ -62,6 +62,9 @@ def _notes(recording: Recording) -> Iterator[str]:
             f"the truth, {1e3 * away:.0f} mm from the guess, is impossible by the guess: no belief will "
             "reach it; widen the guess, or see which of the two is wrong."
         )
+    guess = recording.guess
+    if guess.angle is None and not (guess.tilt or guess.yaw) and np.any(guess.translation):
+        yield "the guess holds the part's rotation fixed: unless that is known, give angle, or tilt and yaw."
     known = _installed_models()
     if recording.model not in known:
         close = get_close_matches(recording.model, known, 1)

@@ -196,7 +196,7 @@ class Sampler:
         if len(times) < 2 or times[0] > stamps[0]:
             raise InputError(
                 f"the {name} stream begins at {times[0]:.3f} s, after the window's first stamp, "
-                f"{stamps[0]:.3f} s; begin the probe when both streams have."
+                f"{stamps[0]:.3f} s; begin the probe when both streams have, and stamp both by one clock."
             )
         after = np.clip(np.searchsorted(times, stamps, side="left"), 1, len(times) - 1)
         gaps = times[after] - times[after - 1]

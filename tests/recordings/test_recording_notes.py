@@ -20,6 +20,8 @@ def test_an_open_mesh_may_be_looked_at() -> None:
     assert problems(seen) == []
     assert len(notes(seen)) == 1 and "open mesh" in notes(seen)[0]
     assert notes(recording) == []
+    held = replace(recording, guess=replace(recording.guess, tilt=0.0, yaw=0.0, angle=None))
+    assert "holds the part's rotation fixed" in notes(held)[0]
 
 
 @pytest.mark.parametrize("name", ["peg_probe", "point_probe_10_pushes"])

@@ -110,7 +110,8 @@ def _touches(
     known = is_known(frame, stamps, fields.cut.gap) & is_known(wrench, stamps, fields.cut.gap)
     felt, world_from_peg, words = mounting.felt(wrench, frame, stamps)
     step = float(stamps[1] - stamps[0])
-    report += [words, f"common stamps: {len(stamps)} at {1.0 / step:.4g} Hz"]
+    both = f"{float(stamps[-1] - stamps[0]):.4g} s, of {frame.times[-1]:.4g} s of poses"
+    report += [words, f"common stamps: {len(stamps)} at {1.0 / step:.4g} Hz over {both}"]
     command = _command(fields, log, start, mounting.frame_from_peg, report)
     return probes(Rows(stamps, felt, world_from_peg, known), fields.cut, fields.arm, command, report)
 
