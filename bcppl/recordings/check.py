@@ -108,7 +108,14 @@ def _problems(recording: Recording, begun: bool = True) -> Iterator[str]:
         yield f"the recording holds no measurement; record at least one ({kinds})."
     wrong = list(_strays(recording))
     for sensor, measurements in by_sensor(recording.measurements):
-        wrong += sensor.problems(measurements, recording)
+        try:
+            wrong += sensor.problems(measurements, recording)
+        except (TypeError, ValueError):  # of numbers that are none, which a sensor need not expect
+            problem = (
+                f"the {sensor.names[1]} cannot be checked, for a field of one is of another type than the "
+                "sensor reads; give numbers and arrays of them."
+            )
+            wrong.append((measurements[0][0], problem))
     for _, problem in sorted(wrong, key=lambda each: each[0]):
         yield problem
 

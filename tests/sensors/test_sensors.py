@@ -143,6 +143,13 @@ def test_problems_of_a_new_kind_stand_where_its_measurements_do(laser: Any) -> N
     ]
 
 
+@pytest.mark.parametrize("metres", ["0.2", None, np.array([0.2, 0.3])])
+def test_a_field_of_another_type_is_one_problem(laser: Any, metres: Any) -> None:
+    (found,) = problems(shone(laser, metres))
+    assert_one_sentence(found)
+    assert "the laser distances cannot be checked" in found
+
+
 @pytest.mark.parametrize("far", [np.inf, np.nan, 0.0, -1.0, 0.05])
 def test_a_laser_without_a_range_is_a_problem(laser: Any, far: float) -> None:
     """Its outliers are spread over the range, so a likelihood without one is no density."""
