@@ -156,7 +156,7 @@ def test_moves_leave_exact_draws_with_copies_as_they_are(
 ) -> None:
     """A normal in 20 axes, learned from four copies of each of 60 draws: from their own, it draws them in."""
     if mutated:
-        for home in ("bcppl.inference.kernels.rejuvenation", "bcppl.inference.chains"):
+        for home in ("bcppl.inference.kernels.rejuvenation", "bcppl.inference.kernels.halving"):
             monkeypatch.setattr(import_module(home), "halved", at_random)
     torch.manual_seed(3)
     changes = []
