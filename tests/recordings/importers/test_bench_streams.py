@@ -66,6 +66,8 @@ def test_wrong_clocks_are_refused(tmp_path: Path) -> None:
         for unit in stated:
             with pytest.raises(InputError, match=rf"probably they are in {right}: state pose\.time\.unit"):
                 read(tmp_path, scale * times, values, unit)
+    with pytest.raises(InputError, match=r"are 1e\+09 ns apart \(1 s\), as of no sensor\."):
+        read(tmp_path, 1e11 * times, values, "ns")
     with pytest.raises(InputError, match="has 0 usable rows"):
         read(tmp_path, times, np.full(1000, np.nan))
 

@@ -36,9 +36,9 @@ def read_stream(name: str, fields: StreamFields, log: Log, report: list[str]) ->
         unit = fields.time.unit
         step = stream.step / factor(unit)
         likely = min(get_args(Time), key=lambda each: abs(math.log(step * factor(each) / USUAL)))
+        other = f"; probably they are in {likely}: state {name}.time.unit" if likely != unit else ""
         raise InputError(
-            f"{name}'s stamps are {step:.4g} {unit} apart ({stream.step:.4g} s), as of no sensor; probably "
-            f"they are in {likely}: state {name}.time.unit."
+            f"{name}'s stamps are {step:.4g} {unit} apart ({stream.step:.4g} s), as of no sensor{other}."
         )
     left_out = [*notes, *left_out]
     report.append(f"{_described(stream)}{''.join(f'; {each}' for each in left_out)}")
